@@ -1,4 +1,4 @@
-//! Opens volumes, takes their digests and cuts them into bricks; prints what each took.
+//! Opens a volume, takes its digest and cuts it into bricks; prints the time of each step.
 //!
 //! `cargo run --release -p slabcast-volumes --example load -- FILE [PRESET]`
 
@@ -36,9 +36,9 @@ fn main() {
             std::process::exit(1);
         }
     };
-    let wanted = BrickNeeds::for_transfer(&tf, &volume.info(digest), Compositing::Linear);
+    let needs = BrickNeeds::for_transfer(&tf, &volume.info(digest), Compositing::Linear);
     let start = Instant::now();
-    let store = BrickStore::build(&volume, digest, &wanted);
+    let store = BrickStore::build(&volume, digest, &needs);
     let built = ms(start);
     let start = Instant::now();
     for info in store.infos().iter() {

@@ -1,5 +1,5 @@
-//! What a folder holds: a Zarr array or pyramid, slices of a DICOM series, pictures of a TIFF
-//! stack, or something that has to be named instead.
+//! Opens a folder: a Zarr array or pyramid, the slices of a DICOM series, or the pictures of a TIFF
+//! stack. For any other folder the error names a volume file in it.
 
 #[cfg(feature = "dicom")]
 use crate::dicom;
@@ -10,10 +10,10 @@ use crate::{Hints, Opened, tiff_stack};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// Most files of a folder that are looked at.
+/// Most files in a folder.
 const FILES_MAX: usize = 100_000;
 
-/// Opens the volume that a folder is.
+/// Opens a folder as a volume.
 pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let name = match folder.file_name() {
         Some(name) => name.to_string_lossy().into_owned(),
@@ -24,22 +24,22 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
         return zarr::open(folder, hints);
     }
     let files = files(folder)?;
-    let of = |sniff: fn(&[u8]) -> bool| -> Vec<PathBuf> {
+    let matching = |sniff: fn(&[u8]) -> bool| -> Vec<PathBuf> {
         files.iter().filter(|(_, head)| sniff(head)).map(|(path, _)| path.clone()).collect()
     };
     #[cfg(feature = "dicom")]
     {
-        let slices = of(dicom::sniff);
+        let slices = matching(dicom::sniff);
         if !slices.is_empty() {
             let (series, reader) = (hints.series.as_deref(), hints.dicom_reader.as_deref());
             return dicom::open(&slices, folder, series, None, reader);
         }
     }
-    let pictures = of(tiff_stack::sniff);
+    let pictures = matching(tiff_stack::sniff);
     if !pictures.is_empty() {
         return Ok(tiff_stack::read_files(pictures, &name, &hints.raw)?.into());
     }
-    // Volumes that somebody may have meant.
+    // Suggest volume files that the user may have meant.
     const ENDS: [&str; 9] =
         [".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd", ".vti", ".raw", ".raw.gz"];
     let mut volumes = files.iter().filter_map(|(path, _)| {
@@ -54,14 +54,14 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     Err(Problem::new(OpenErrorKind::NotAVolume, "folder", "holds no slices or pictures", remedy))
 }
 
-/// Opens the series that a DICOM file is a slice of.
+/// Opens the series that a DICOM file belongs to.
 #[cfg(feature = "dicom")]
 pub(crate) fn open_series_of(file: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let folder = match file.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
         _ => Path::new("."),
     };
-    // Spelt as the folder's own list has it.
+    // Spelt as in the folder's list, which is compared with it.
     let file = folder.join(file.file_name().unwrap_or_default());
     let slices = dicom_files(folder)?;
     let mut opened = dicom::open(
@@ -81,22 +81,22 @@ pub(crate) fn open_series_of(file: &Path, hints: &Hints) -> Result<Opened, Probl
     Ok(opened)
 }
 
-/// The DICOM files of a folder.
+/// Returns the DICOM files of a folder, in the order of the numbers in their names.
 #[cfg(feature = "dicom")]
 pub(crate) fn dicom_files(folder: &Path) -> Result<Vec<PathBuf>, Problem> {
     let files = files(folder)?;
     Ok(files.into_iter().filter(|(_, head)| dicom::sniff(head)).map(|(path, _)| path).collect())
 }
 
-/// Files of a folder in the order of their numbers, each with its first bytes; hidden ones and
-/// folders are left out.
+/// Returns the files of a folder in the order of the numbers in their names, each with its first
+/// 136 bytes. Leaves out hidden files and folders.
 fn files(folder: &Path) -> Result<Vec<(PathBuf, Vec<u8>)>, Problem> {
     let io = |e: &std::io::Error| Problem::io("folder", e);
     let mut paths = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(|e| io(&e))? {
         let entry = entry.map_err(|e| io(&e))?;
         let hidden = entry.file_name().to_string_lossy().starts_with('.');
-        // A link counts as what it leads to; a pipe is never opened.
+        // Links are followed; pipes are never opened.
         if !hidden && std::fs::metadata(entry.path()).is_ok_and(|m| m.is_file()) {
             paths.push(entry.path());
         }
@@ -109,10 +109,10 @@ fn files(folder: &Path) -> Result<Vec<(PathBuf, Vec<u8>)>, Problem> {
             ));
         }
     }
-    paths.sort_by(|a, b| tiff_stack::by_number(a, b));
+    paths.sort_by(|a, b| tiff_stack::compare_by_number(a, b));
     let head = |path: &Path| {
         let mut head = Vec::new();
-        // What can't be read is no slice; if it was meant as one, its number will be missed.
+        // An unreadable file counts as no slice; if it is one, its gap is noticed later.
         if let Ok(file) = std::fs::File::open(path) {
             let _ = file.take(136).read_to_end(&mut head);
         }

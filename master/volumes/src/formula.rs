@@ -104,7 +104,8 @@ fn volume(name: &str, dims: [u32; 3], title: &str) -> Option<Volume> {
             if !across(i, nx) || !across(k, nz) {
                 return 0;
             }
-            // The default eye looks from +y (docs/design/contracts.md): the weaker plate is in front.
+            // The default eye looks from +y (docs/design/contracts.md): the weaker plate is in
+            // front.
             match 16 * j / ny {
                 10..12 => 100,
                 4..6 => 200,

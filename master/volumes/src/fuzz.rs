@@ -1,8 +1,8 @@
-//! Mutants of small files through every parser: no panic, no hang, no memory out of nothing.
+//! Feeds mutants of small files to every parser. None may panic, hang, or take memory without data.
 //!
-//! Half of what a mutant does is plain noise; the other half puts numbers where numbers were,
-//! since parsers of sizes fail on numbers, not on noise. Gzip mutants are spoiled before or
-//! after packing, so that damage gets past the checksum. The seed is in every failure message.
+//! Half of the mutations are noise; the other half replace numbers by numbers, since parsers of
+//! sizes fail on numbers. Gzip mutants are mutated before or after compression, so that damage gets
+//! past the checksum. Every failure message has the seed.
 //!
 //! 20,000 mutants for each parser in every test run, 100,000 in `tests/nightly.sh`;
 //! `SLABCAST_MUTANTS` sets another number. docs/measurements/hostile-files.md has the figures of
@@ -52,7 +52,7 @@ pub(crate) fn base64(bytes: &[u8]) -> Vec<u8> {
     bytes.chunks(3).flat_map(group).collect()
 }
 
-/// xorshift64*: small, and the same everywhere.
+/// The generator xorshift64*, the same on every machine.
 struct Rng(u64);
 
 impl Rng {
@@ -67,8 +67,8 @@ impl Rng {
         ((self.next() >> 33) as usize) % n.max(1)
     }
 
-    fn pick<'a, T>(&mut self, from: &'a [T]) -> &'a T {
-        &from[self.below(from.len())]
+    fn pick<'a, T>(&mut self, list: &'a [T]) -> &'a T {
+        &list[self.below(list.len())]
     }
 }
 
@@ -124,6 +124,7 @@ const WORDS: [&str; 48] = [
 ];
 
 impl Rng {
+    /// Applies 1 to 4 mutations; `others` are files to splice in.
     fn mutate(&mut self, bytes: &mut Vec<u8>, others: &[Vec<u8>]) {
         for _ in 0..1 + self.below(4) {
             let at = self.below(bytes.len());
@@ -139,7 +140,7 @@ impl Rng {
                     let word = self.pick(&WORDS).bytes();
                     bytes.splice(at..at, word);
                 }
-                // A number in the place of a number.
+                // Replaces a decimal number by a word.
                 5 | 6 => {
                     let Some(from) = bytes[at..].iter().position(u8::is_ascii_digit) else {
                         continue;
@@ -149,7 +150,7 @@ impl Rng {
                     let word = self.pick(&WORDS).bytes();
                     bytes.splice(from..from + len, word);
                 }
-                // A binary number of 2, 4 or 8 bytes.
+                // Overwrites 2, 4 or 8 bytes by a binary number.
                 7 => {
                     let value = *self.pick(&[0u64, 1, 5, 255, 0x7fff, 0x8000, 1 << 31, u64::MAX]);
                     let float = (*self.pick(&[0.0f32, -1.0, 1e30, f32::NAN])).to_le_bytes();
@@ -171,31 +172,32 @@ impl Rng {
     }
 }
 
-/// A line of the process's memory in KiB; 0 where the system does not say.
+/// Returns a figure of `/proc/self/status` in KiB; 0 where the system has none.
 fn resident_kib(name: &str) -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find(|l| l.starts_with(name)).unwrap_or_default();
     line.split_ascii_whitespace().nth(1).and_then(|n| n.parse().ok()).unwrap_or(0)
 }
 
-/// Mutants of a test run: a fifth of a second of processor time for the quickest parser, a second
-/// for the slowest.
+/// Mutants for each parser in a test run: 0.2 s of processor time for the quickest, 1 s for the
+/// slowest.
 const MUTANTS: u64 = 20_000;
 
-/// Number of mutants for each parser: `SLABCAST_MUTANTS`, or [`MUTANTS`].
+/// Returns the number of mutants for each parser: `SLABCAST_MUTANTS`, or [`MUTANTS`].
 fn mutants() -> u64 {
     std::env::var("SLABCAST_MUTANTS").ok().and_then(|n| n.parse().ok()).unwrap_or(MUTANTS)
 }
 
-/// Largest mutant.
+/// Size of the largest mutant.
 const MUTANT_MAX_BYTES: usize = 1 << 16;
-/// What reading a mutant may take: 16 MiB, and twice its bytes (docs/design/promises.md R13).
+/// Most memory that reading a mutant may take: 16 MiB, and twice its bytes (docs/design/promises.md
+/// R13).
 const GROWTH_MAX_KIB: u64 = (16 << 10) + 2 * MUTANT_MAX_BYTES as u64 / 1024;
-/// Set in a process that runs one test alone.
-const ALONE: &str = "SLABCAST_MUTANTS_ALONE";
+/// Environment variable that marks a process which runs one test alone.
+const ALONE_VARIABLE: &str = "SLABCAST_MUTANTS_ALONE";
 static ONE_AT_A_TIME: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
-/// Opens `count` mutants.
+/// Opens `count` mutants and checks time, memory and errors. `mutant` makes one, `open` reads it.
 fn survive(
     what: &str,
     count: u64,
@@ -203,21 +205,21 @@ fn survive(
     open: impl Fn(Vec<u8>) -> Result<Option<Volume>, Problem>,
 ) {
     let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-    // Memory is that of a process, and other tests take some of this one's: the test runs once more,
-    // in a process of its own. There, on one thread, threads have no test's name.
+    // Memory is measured per process, so the test runs again in a process of its own. There, with
+    // one test thread, the thread has no test's name.
     let test = std::thread::current().name().filter(|name| *name != "main").map(str::to_owned);
-    if let Some(test) = test.filter(|_| std::env::var_os(ALONE).is_none()) {
+    if let Some(test) = test.filter(|_| std::env::var_os(ALONE_VARIABLE).is_none()) {
         let program = std::env::current_exe().expect("a test has a program");
         let status = std::process::Command::new(program)
             .args([&test, "--exact", "--nocapture", "--test-threads=1"])
-            .env(ALONE, "1")
+            .env(ALONE_VARIABLE, "1")
             .status();
         assert!(status.expect("the program runs once more").success(), "{what}: see above");
         return;
     }
     let support = Support { intervals: vec![(0.0, f64::MAX)], nan: true };
     let wanted = BrickNeeds { support, normals: true, gradients: true, crop: None };
-    // The peak begins anew, where the system lets it.
+    // Resets the peak of resident memory, where the system allows it.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
     let before_kib = resident_kib("VmHWM:");
     let (mut opened, mut slowest, began) = (0, Duration::ZERO, Instant::now());
@@ -235,8 +237,8 @@ fn survive(
                 let (lo, hi) = volume.summary.range();
                 assert!(lo.is_finite() && hi.is_finite(), "{what} seed {seed}: {lo} to {hi}");
                 assert!(volume.lattice.check().is_ok(), "{what} seed {seed}");
-                // Bricks have a memory of their own, up to eight bytes a voxel: those of a page that
-                // unpacks to megabytes would be counted as what reading takes.
+                // Only small volumes are cut: bricks take up to eight bytes a voxel, which would
+                // count as memory of the reader.
                 if seed % 64 == 0 && volume.samples.len() <= 1 << 18 {
                     BrickStore::build(&volume, Digest32::default(), &wanted);
                 }
@@ -254,7 +256,10 @@ fn survive(
         began.elapsed(),
         grown_kib as f64 / 1024.0
     );
-    assert!(opened > 0, "{what}: mutants are all refused, so they test nothing behind the door");
+    assert!(
+        opened > 0,
+        "{what}: all mutants were refused, so nothing behind the header was tested"
+    );
     assert!(slowest < Duration::from_secs(2), "{what}: one took {slowest:?}; 0.1 s is promised");
     assert!(
         grown_kib < GROWTH_MAX_KIB,
@@ -262,16 +267,16 @@ fn survive(
     );
 }
 
-/// Mutants of whole files, read as files are.
+/// Runs mutants of whole files through the reader of files.
 fn survive_files(what: &str, folder: &Path, mutant: impl FnMut(&mut Rng) -> Vec<u8>) {
     survive(what, mutants(), mutant, |bytes| {
         let hints = Hints::default();
-        read(Source::memory(bytes), folder, "mutant_4x3x2_uint8.raw", &hints).map(Some)
+        read(Source::from_bytes(bytes), folder, "mutant_4x3x2_uint8.raw", &hints).map(Some)
     });
 }
 
-/// Now and then one of `seeds` as it is, else a mutant of it.
-fn one_of(rng: &mut Rng, seeds: &[Vec<u8>]) -> Vec<u8> {
+/// Returns one of `seeds`, mutated in 15 of 16 cases.
+fn seed_or_mutant(rng: &mut Rng, seeds: &[Vec<u8>]) -> Vec<u8> {
     let mut bytes = rng.pick(seeds).clone();
     if rng.below(16) > 0 {
         rng.mutate(&mut bytes, seeds);
@@ -324,7 +329,7 @@ fn nrrd_mutants_neither_panic_nor_hang_nor_fill_memory() {
         attached.iter().chain(&packed).chain(&detached).chain(&text).cloned().collect();
     let bzipped = bzip2(&data);
     survive_files("nrrd", folder.path(), |rng| match rng.below(10) {
-        8 => one_of(rng, &text),
+        8 => seed_or_mutant(rng, &text),
         9 => {
             let bytes = packed[0].clone();
             let mut bytes = String::from_utf8(bytes).unwrap().replace("gzip", "bzip2").into_bytes();
@@ -365,13 +370,13 @@ fn nrrd_mutants_neither_panic_nor_hang_nor_fill_memory() {
 
 #[test]
 fn nifti_mutants_neither_panic_nor_hang_nor_fill_memory() {
-    use crate::nifti::tests::{Form, nifti1, nifti2};
+    use crate::nifti::tests::{Affine, nifti1, nifti2};
     let seeds: Vec<Vec<u8>> = vec![
-        nifti1(false, 2, [4, 3, 2], Form::Sform),
-        nifti1(true, 4, [4, 3, 2], Form::Qform),
-        nifti1(false, 16, [3, 2, 2], Form::Spacing),
-        nifti1(true, 64, [3, 2, 2], Form::Sform),
-        nifti1(false, 256, [4, 3, 2], Form::Qform),
+        nifti1(false, 2, [4, 3, 2], Affine::Sform),
+        nifti1(true, 4, [4, 3, 2], Affine::Qform),
+        nifti1(false, 16, [3, 2, 2], Affine::Spacing),
+        nifti1(true, 64, [3, 2, 2], Affine::Sform),
+        nifti1(false, 256, [4, 3, 2], Affine::Qform),
         nifti2(false, 768, [2, 3, 2]),
         nifti2(true, 1024, [2, 3, 2]),
     ];
@@ -421,7 +426,7 @@ fn metaimage_mutants_neither_panic_nor_hang_nor_fill_memory() {
         head("ElementType = MET_UCHAR\nElementDataFile = LIST\nd1.raw\nd2.raw\n", b""),
         head("ElementType = MET_USHORT\nElementDataFile = d%d.raw 1 2 1\n", b""),
     ];
-    survive_files("metaimage", folder.path(), |rng| one_of(rng, &seeds));
+    survive_files("metaimage", folder.path(), |rng| seed_or_mutant(rng, &seeds));
 }
 
 #[test]
@@ -432,7 +437,7 @@ fn vti_mutants_neither_panic_nor_hang_nor_fill_memory() {
         .iter()
         .flat_map(|way| [vti(*way, "UInt8", &data, 4, false), vti(*way, "UInt8", &data, 8, true)])
         .collect();
-    survive_files("vti", Path::new("/nonexistent"), |rng| one_of(rng, &seeds));
+    survive_files("vti", Path::new("/nonexistent"), |rng| seed_or_mutant(rng, &seeds));
 }
 
 #[test]
@@ -448,13 +453,13 @@ fn tiff_mutants_neither_panic_nor_hang_nor_fill_memory() {
     .into_iter()
     .map(|compression| pages(2, compression))
     .collect();
-    survive_files("tiff", Path::new("/nonexistent"), |rng| one_of(rng, &seeds));
+    survive_files("tiff", Path::new("/nonexistent"), |rng| seed_or_mutant(rng, &seeds));
 }
 
 #[test]
 fn raw_mutants_neither_panic_nor_hang_nor_fill_memory() {
     let seeds = [(0..24).collect::<Vec<u8>>(), gzip(&(0..24).collect::<Vec<u8>>())];
-    survive_files("raw", Path::new("/nonexistent"), |rng| one_of(rng, &seeds));
+    survive_files("raw", Path::new("/nonexistent"), |rng| seed_or_mutant(rng, &seeds));
 }
 
 #[cfg(feature = "dicom")]
@@ -467,17 +472,17 @@ fn dicom_mutants_neither_panic_nor_hang_nor_fill_memory() {
     survive(
         "dicom",
         mutants(),
-        |rng| one_of(rng, &seeds),
-        |bytes| crate::dicom::one_slice(Source::memory(bytes)).map(|_| None),
+        |rng| seed_or_mutant(rng, &seeds),
+        |bytes| crate::dicom::one_slice(Source::from_bytes(bytes)).map(|_| None),
     );
 }
 
-/// A tenth of the others' number: its files are many, and are written before each is tried.
+/// Runs a tenth of the number of mutants, since each writes files first.
 #[cfg(feature = "zarr")]
 #[test]
 fn zarr_mutants_neither_panic_nor_hang_nor_fill_memory() {
     use crate::zarr::tests::{pyramid, sharded, version_2};
-    // In memory where the system has a folder there: a disk would be what is tried.
+    // In memory if possible, so that the disk is not what is measured.
     let folder = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap();
     // Each array with the file that is mutated.
     let mut seeds: Vec<(std::path::PathBuf, Vec<u8>)> = Vec::new();
@@ -497,7 +502,7 @@ fn zarr_mutants_neither_panic_nor_hang_nor_fill_memory() {
     keep("pyramid", ".zattrs");
     keep("pyramid", "0/.zarray");
     let others: Vec<Vec<u8>> = seeds.iter().map(|(_, bytes)| bytes.clone()).collect();
-    // A mutant that asks for many chunks has each of them looked for; 64 KiB are some 2700 of these.
+    // Limits the chunks that a mutant can ask for, to some 2700.
     let hints = Hints { max_bytes: Some(64 << 10), ..Hints::default() };
     survive(
         "zarr",

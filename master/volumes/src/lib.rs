@@ -1,8 +1,8 @@
 //! Reads volume files and cuts volumes into bricks.
 //!
-//! [`open`] reads a file into a [`Volume`] or computes one from a formula. [`BrickStore::build`] cuts
-//! a volume into the bricks that a transfer function can see (paper section 4.2). Each brick is
-//! encoded once, and every worker is sent those bytes.
+//! [`open`] reads a file into a [`Volume`] or computes one from a formula. [`BrickStore::build`]
+//! cuts a volume into the bricks that a transfer function can see (paper section 4.2). Each brick
+//! is encoded once, and every worker is sent those bytes.
 //!
 //! ```
 //! use slabcast_common::quality::Compositing;

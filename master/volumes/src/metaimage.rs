@@ -1,11 +1,12 @@
-//! MetaImage, attached (`.mha`) and detached (`.mhd` over one data file, or a list of them).
+//! Reader of MetaImage, attached (`.mha`) and detached (`.mhd` with one data file or a list of
+//! them).
 //!
-//! A header is lines of `Key = Value`; `ElementDataFile` is the last of them. The format is told
-//! at itk.org/Wiki/MetaIO/Documentation; where that is silent we do what ITK's reader does, since
+//! Documentation: itk.org/Wiki/MetaIO/Documentation. A header is lines of `Key = Value`, the last
+//! of them `ElementDataFile`. Where the documentation is silent this follows ITK's reader, since
 //! ITK writes nearly all such files: rows of `TransformMatrix` are the directions of the index
-//! axes, space is LPS, and `CenterOfRotation` is not looked at.
+//! axes, space is LPS, and `CenterOfRotation` is ignored.
 
-use crate::data::{self, Form, HeaderLines, Skip};
+use crate::data::{self, HeaderLines, Skip, Storage};
 use crate::error::{Problem, quoted};
 use crate::samples::{Endian, Layout, Number};
 use crate::source::Source;
@@ -15,47 +16,48 @@ use slabcast_common::volume::{Lattice, Volume};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// The key that ends the header, in small letters.
+/// Key of the header's last line, in lower case.
 const DATA_FILE: &str = "elementdatafile";
 
-/// Whether these first bytes are a header: a known key and an equals sign begin it.
+/// Returns whether the first bytes are a header: a known key and an equals sign.
 pub(crate) fn sniff(head: &[u8]) -> bool {
     let line = head.split(|b| *b == b'\n').next().unwrap_or_default();
-    let Some(at) = line.iter().position(|b| *b == b'=') else { return false };
-    let key = String::from_utf8_lossy(&line[..at]).trim().to_ascii_lowercase();
+    let Some(equals) = line.iter().position(|b| *b == b'=') else { return false };
+    let key = String::from_utf8_lossy(&line[..equals]).trim().to_ascii_lowercase();
     matches!(key.as_str(), "objecttype" | "ndims" | "comment" | "objectsubtype")
 }
 
-/// Reads a volume from a source at its beginning. `folder` is where a detached header lies.
+/// Reads a volume from the start of a source. `folder` is the header's folder, where detached data
+/// must lie.
 pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volume, Problem> {
     let (fields, header_bytes) = Fields::read(&mut source)?;
     let layout = layout(&fields)?;
-    let (lattice, anatomical) = place(&fields, layout.dims)?;
-    let form = form(&fields)?;
+    let (lattice, anatomical) = lattice(&fields, layout.dims)?;
+    let storage = storage(&fields)?;
     let (samples, map) = match data_files(&fields, layout.dims)? {
         None => {
             let len = source.len.saturating_sub(header_bytes);
-            data::read(source, len, &form, &layout)?
+            data::read(source, len, &storage, &layout)?
         }
-        Some(names) => data::read_files(folder, &names, "ElementDataFile", &form, &layout)?,
+        Some(names) => data::read_files(folder, &names, "ElementDataFile", &storage, &layout)?,
     };
     Ok(Volume::new(name, layout.number.name(), anatomical, lattice, samples, map))
 }
 
-/// The fields as written: key in small letters to line number, key and value.
+/// The header's fields: line number, key and value by key in lower case.
 struct Fields {
     lines: BTreeMap<String, (usize, String, String)>,
-    /// Names of data files, where `ElementDataFile = LIST` announced them.
+    /// Names of data files after `ElementDataFile = LIST`.
     list: Vec<String>,
 }
 
 impl Fields {
-    /// Reads the lines of a header; also says how many bytes they take.
+    /// Reads the lines of a header and returns their bytes with the fields.
     fn read(source: &mut Source) -> Result<(Fields, u64), Problem> {
         let mut lines = BTreeMap::new();
         let (mut list, mut in_list) = (Vec::new(), false);
         const END: &str = "end the header with `ElementDataFile = LOCAL` or the data file's name";
-        let mut header = HeaderLines::of(source, END);
+        let mut header = HeaderLines::new(source, END);
         loop {
             let Some((number, text)) = header.next()? else {
                 if in_list {
@@ -79,10 +81,10 @@ impl Fields {
                 ));
             };
             let (key, value) = (key.trim(), value.trim().to_string());
-            let small = key.to_ascii_lowercase();
-            let last = small == DATA_FILE;
+            let lower = key.to_ascii_lowercase();
+            let last = lower == DATA_FILE;
             in_list = last && value.split_ascii_whitespace().next() == Some("LIST");
-            if let Some((before, ..)) = lines.insert(small, (number, key.to_string(), value)) {
+            if let Some((before, ..)) = lines.insert(lower, (number, key.to_string(), value)) {
                 return Err(Problem::malformed(
                     format!("line {number}"),
                     format!("{} was given in line {before} already", quoted(key)),
@@ -93,16 +95,16 @@ impl Fields {
                 break;
             }
         }
-        Ok((Fields { lines, list }, header.consumed()))
+        Ok((Fields { lines, list }, header.consumed_bytes()))
     }
 
-    /// The value of the first of these keys that is there, and the key.
+    /// Returns key and value of the first of `keys` that is present.
     fn get<'a>(&'a self, keys: &[&str]) -> Option<(&'a str, &'a str)> {
         let found = keys.iter().find_map(|k| self.lines.get(&k.to_ascii_lowercase()));
         found.map(|(_, key, value)| (key.as_str(), value.as_str()))
     }
 
-    /// Refuses the value of `key`, which is there.
+    /// Returns an error about the value of `key`, which must be present.
     fn bad(&self, key: &str, why: &str, remedy: &str) -> Problem {
         let (line, key, value) = &self.lines[&key.to_ascii_lowercase()];
         Problem::malformed(
@@ -118,7 +120,7 @@ impl Fields {
         })
     }
 
-    /// `True` or `False`.
+    /// Parses `True` or `False`; `None` if no key is present.
     fn flag(&self, keys: &[&str]) -> Result<Option<bool>, Problem> {
         let Some((key, value)) = self.get(keys) else { return Ok(None) };
         match value.to_ascii_lowercase().as_str() {
@@ -128,7 +130,7 @@ impl Fields {
         }
     }
 
-    /// `N` numbers.
+    /// Parses `N` numbers; `None` if no key is present.
     fn numbers<const N: usize>(&self, keys: &[&str]) -> Result<Option<[f64; N]>, Problem> {
         let Some((key, value)) = self.get(keys) else { return Ok(None) };
         let numbers: Result<Vec<f64>, _> = value.split_ascii_whitespace().map(str::parse).collect();
@@ -175,7 +177,7 @@ fn layout(fields: &Fields) -> Result<Layout, Problem> {
         }
     };
     let big = fields.flag(&["BinaryDataByteOrderMSB", "ElementByteOrderMSB"])?;
-    // ITK takes the machine's order where the file says none, and machines are little-endian.
+    // Without the field ITK assumes the machine's order, which is little-endian.
     let endian = if big == Some(true) { Endian::Big } else { Endian::Little };
     fields.required("DimSize", "256 256 256")?;
     let sizes: Vec<u64> = fields
@@ -190,7 +192,7 @@ fn layout(fields: &Fields) -> Result<Layout, Problem> {
     Layout::new(dims, number, endian, "DimSize")
 }
 
-fn form(fields: &Fields) -> Result<Form, Problem> {
+fn storage(fields: &Fields) -> Result<Storage, Problem> {
     let binary = fields.flag(&["BinaryData"])?.unwrap_or(true);
     let packed = fields.flag(&["CompressedData"])?.unwrap_or(false);
     let encoding = match (binary, packed) {
@@ -212,11 +214,11 @@ fn form(fields: &Fields) -> Result<Form, Problem> {
             fields.bad(key, "is no number of bytes", "give -1 (raw data alone), 0 or more")
         })?),
     };
-    Ok(Form { encoding, line_skip: 0, byte_skip, skip_field: "HeaderSize" })
+    Ok(Storage { encoding, line_skip: 0, byte_skip, skip_field: "HeaderSize" })
 }
 
-/// `LOCAL`, one name, `LIST [axes]` with names in lines of their own, or `name%03d.raw min max
-/// step`; lists have a file a slice.
+/// Returns the data files of `LOCAL` (`None`), one name, `LIST [axes]` with a name on each
+/// following line, or `name%03d.raw min max step`. By default a file of a list holds one slice.
 fn data_files(fields: &Fields, dims: [u32; 3]) -> Result<Option<Vec<String>>, Problem> {
     let value = fields.required("ElementDataFile", "LOCAL")?;
     let bad = |why: &str, remedy: &str| Err(fields.bad(DATA_FILE, why, remedy));
@@ -234,10 +236,12 @@ fn data_files(fields: &Fields, dims: [u32; 3]) -> Result<Option<Vec<String>>, Pr
                 && (1..=3).contains(&range.len())
                 && range.iter().all(|w| w.parse::<i64>().is_ok()) =>
         {
-            let n = |at: usize, or: i64| range.get(at).map_or(or, |w| w.parse().unwrap_or(or));
-            // MetaIO: min alone means as many files as there are slices.
+            let n = |i: usize, default: i64| {
+                range.get(i).map_or(default, |w| w.parse().unwrap_or(default))
+            };
+            // In MetaIO, min alone means one file for each slice.
             let max = n(1, n(0, 0).saturating_add(i64::from(dims[2]) - 1));
-            match data::numbered(pattern, n(0, 0), max, n(2, 1)) {
+            match data::numbered_names(pattern, n(0, 0), max, n(2, 1)) {
                 Some(names) => (names, 2),
                 None => {
                     return bad(
@@ -259,22 +263,22 @@ fn data_files(fields: &Fields, dims: [u32; 3]) -> Result<Option<Vec<String>>, Pr
     Ok(Some(names))
 }
 
-/// Where the samples lie, and whether that is said in anatomical axes.
-fn place(fields: &Fields, dims: [u32; 3]) -> Result<(Lattice, bool), Problem> {
-    // ITK writes ElementSpacing; ElementSize is how large a sample is, and stands in for it.
+/// Returns the lattice in RAS+, and whether its axes are anatomical.
+fn lattice(fields: &Fields, dims: [u32; 3]) -> Result<(Lattice, bool), Problem> {
+    // ITK writes ElementSpacing; ElementSize, the size of a sample, serves where it is absent.
     let spacing = fields.numbers::<3>(&["ElementSpacing", "ElementSize"])?.unwrap_or([1.0; 3]);
     let rows = fields.numbers::<9>(&["TransformMatrix", "Rotation", "Orientation"])?;
     let origin = fields.numbers::<3>(&["Offset", "Position", "Origin"])?.unwrap_or([0.0; 3]);
     let mut lattice = Lattice::from_spacing(dims, spacing);
     let Some(m) = rows else {
-        // Spacings alone: the file does not say where its axes point.
+        // With spacings alone the file does not say where its axes point.
         lattice.origin = DVec3::from_array(origin);
         lattice.check().map_err(|e| {
             Problem::malformed("ElementSpacing", e, "correct the spacing or the offset")
         })?;
         return Ok((lattice, false));
     };
-    // LPS to RAS; `+ 0.0` makes of -0.0 a 0.0, so that a digest does not depend on it.
+    // LPS to RAS. Adding zero turns -0.0 into 0.0, which the digest would distinguish.
     let ras = |v: DVec3| v * DVec3::new(-1.0, -1.0, 1.0) + DVec3::ZERO;
     for a in 0..3 {
         lattice.steps[a] = ras(DVec3::new(m[3 * a], m[3 * a + 1], m[3 * a + 2]) * spacing[a]);

@@ -1,9 +1,8 @@
-//! NIfTI-1 and NIfTI-2 in one file (`.nii`, `.nii.gz`), in both byte orders.
+//! Reader of NIfTI-1 and NIfTI-2 in one file (`.nii`, `.nii.gz`), in both byte orders.
 //!
-//! The header is a struct of C, so reading it is a table of offsets; [`Header::of`] has the two
-//! tables side by side. World axes are RAS+ by definition. Which affine counts: the sform if
-//! its code is above zero, else the qform, else the spacings alone (methods 3, 2 and 1 of
-//! nifti1.h); that is also nibabel's order.
+//! The header is a C struct, read by a table of offsets; [`Header::parse`] has the tables of both
+//! versions. World axes are RAS+ by definition. The affine is the sform if its code is above zero,
+//! else the qform, else the spacings alone (methods 3, 2 and 1 of nifti1.h), as in nibabel.
 
 use crate::error::{OpenErrorKind, Problem};
 use crate::samples::{self, Endian, Layout, Number, SKIP_MAX_BYTES, Supply};
@@ -13,23 +12,23 @@ use glam::{DMat3, DVec3};
 use slabcast_common::volume::{Lattice, ValueMap, Volume};
 use std::io::Read;
 
-/// Bytes of a NIfTI-2 header.
-const HEADER_2: usize = 540;
+/// Size of a NIfTI-2 header.
+const HEADER_2_BYTES: usize = 540;
 
-/// Whether these first bytes (inflated, if they were gzip) are a header: of one file, of a pair
-/// or of ANALYZE, so that the latter can be refused by their names.
+/// Returns whether the first bytes, after decompression, are a header: of one file, or of a pair or
+/// ANALYZE, which are then refused by name.
 pub(crate) fn sniff(head: &[u8]) -> bool {
     let Some(size) = head.first_chunk::<4>() else { return false };
     matches!(u32::from_le_bytes(*size), 348 | 540) || matches!(u32::from_be_bytes(*size), 348 | 540)
 }
 
-/// Reads a volume from a source at its beginning.
+/// Reads a volume from the start of a source.
 pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Problem> {
     let len = source.len;
     let mut reader: Box<dyn Read + Send> =
         if gzip { Box::new(MultiGzDecoder::new(source.reader)) } else { Box::new(source.reader) };
     let reader = &mut *reader;
-    let mut bytes = [0u8; HEADER_2];
+    let mut bytes = [0u8; HEADER_2_BYTES];
     fill(reader, &mut bytes[..4])?;
     let size = *bytes.first_chunk::<4>().expect("four bytes");
     let (size, endian) = match (u32::from_le_bytes(size), u32::from_be_bytes(size)) {
@@ -44,10 +43,10 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
         }
     };
     fill(reader, &mut bytes[4..size])?;
-    let header = Header::of(&bytes[..size], endian)?;
+    let header = Header::parse(&bytes[..size], endian)?;
     let layout = header.layout(endian)?;
-    let (lattice, anatomical) = header.place(layout.dims)?;
-    let skip = header.skip(size as u64)?;
+    let (lattice, anatomical) = header.lattice(layout.dims)?;
+    let skip = header.skip_bytes(size as u64)?;
     if !source::skip_bytes(reader, skip).map_err(|e| broken(&e))? {
         return Err(Problem::malformed(
             "vox_offset",
@@ -95,16 +94,16 @@ fn broken(e: &std::io::Error) -> Problem {
     }
 }
 
-/// Numbers at offsets, in the file's byte order.
-struct Bytes<'a> {
+/// Reads numbers at offsets of the header, in the file's byte order.
+struct HeaderBytes<'a> {
     bytes: &'a [u8],
     endian: Endian,
 }
 
 macro_rules! getters {
     ($($name:ident: $t:ty),*) => {$(
-        fn $name(&self, at: usize) -> $t {
-            let word = *self.bytes[at..].first_chunk().expect("offsets lie inside the header");
+        fn $name(&self, offset: usize) -> $t {
+            let word = *self.bytes[offset..].first_chunk().expect("offsets lie inside the header");
             match self.endian {
                 Endian::Little => <$t>::from_le_bytes(word),
                 Endian::Big => <$t>::from_be_bytes(word),
@@ -113,11 +112,11 @@ macro_rules! getters {
     )*};
 }
 
-impl Bytes<'_> {
+impl HeaderBytes<'_> {
     getters!(i16: i16, i32: i32, i64: i64, f32: f32, f64: f64);
 }
 
-/// The fields that we use, as both versions have them.
+/// The header fields that are used, named as in nifti1.h.
 struct Header {
     /// `dim[0]` to `dim[7]`.
     dim: [i64; 8],
@@ -135,9 +134,9 @@ struct Header {
 }
 
 impl Header {
-    fn of(bytes: &[u8], endian: Endian) -> Result<Header, Problem> {
-        let two = bytes.len() == HEADER_2;
-        let magic = if two { &bytes[4..8] } else { &bytes[344..348] };
+    fn parse(bytes: &[u8], endian: Endian) -> Result<Header, Problem> {
+        let version_2 = bytes.len() == HEADER_2_BYTES;
+        let magic = if version_2 { &bytes[4..8] } else { &bytes[344..348] };
         match magic {
             b"n+1\0" | b"n+2\0" => {}
             b"ni1\0" | b"ni2\0" => {
@@ -158,9 +157,9 @@ impl Header {
                 ));
             }
         }
-        let b = Bytes { bytes, endian };
+        let b = HeaderBytes { bytes, endian };
         use std::array::from_fn;
-        Ok(if two {
+        Ok(if version_2 {
             Header {
                 dim: from_fn(|i| b.i64(16 + 8 * i)),
                 datatype: b.i16(12),
@@ -176,7 +175,7 @@ impl Header {
                 srow: from_fn(|r| from_fn(|c| b.f64(400 + 32 * r + 8 * c))),
             }
         } else {
-            let f = |at| f64::from(b.f32(at));
+            let f = |offset| f64::from(b.f32(offset));
             Header {
                 dim: from_fn(|i| b.i16(40 + 2 * i).into()),
                 datatype: b.i16(70),
@@ -243,10 +242,10 @@ impl Header {
         Layout::new(dims, number, endian, "dim")
     }
 
-    /// Bytes between the header and the first sample.
-    fn skip(&self, header_bytes: u64) -> Result<u64, Problem> {
+    /// Returns the bytes between the header and the first sample.
+    fn skip_bytes(&self, header_bytes: u64) -> Result<u64, Problem> {
         let offset = self.vox_offset;
-        // Some programs leave it zero; the samples then follow the four bytes of the extender.
+        // Some programs leave it zero; samples then follow the four bytes of the extender.
         if offset == 0.0 {
             return Ok(4);
         }
@@ -261,14 +260,14 @@ impl Header {
         Ok(offset as u64 - header_bytes)
     }
 
-    /// The lattice, and whether the file says where it lies in the body.
-    fn place(&self, dims: [u32; 3]) -> Result<(Lattice, bool), Problem> {
+    /// Returns the lattice, and whether its axes are anatomical.
+    fn lattice(&self, dims: [u32; 3]) -> Result<(Lattice, bool), Problem> {
         let mm = match self.units & 7 {
             1 => 1000.0,
             3 => 1e-3,
             _ => 1.0,
         };
-        // A spacing is a length; some programs write it with the sign of the axis.
+        // Some programs write a spacing with the sign of its axis.
         let spacing: [f64; 3] = std::array::from_fn(|a| self.pixdim[a + 1].abs());
         let (steps, origin, field) = if self.sform_code > 0 {
             let column = |c: usize| DVec3::from_array(self.srow.map(|row| row[c]));
@@ -282,14 +281,15 @@ impl Header {
         } else {
             (Lattice::from_spacing(dims, spacing).steps, DVec3::ZERO, "pixdim")
         };
-        // `+ 0.0` makes of -0.0 a 0.0, so that a volume's digest does not depend on it.
+        // Adding zero turns -0.0 into 0.0, which the volume's digest would distinguish.
         let steps = steps.map(|s| s * mm + DVec3::ZERO);
         let lattice = Lattice { dims, steps, origin: origin * mm + DVec3::ZERO };
         lattice.check().map_err(|e| Problem::malformed(field, e, "correct the header's affine"))?;
         Ok((lattice, self.sform_code > 0 || self.qform_code > 0))
     }
 
-    /// The qform's rotation; the unit quaternion is (a, b, c, d) with a left out of the file.
+    /// Returns the rotation of the qform's unit quaternion (a, b, c, d), whose a is not in the
+    /// file.
     fn rotation(&self) -> Result<DMat3, Problem> {
         let [b, c, d] = self.quatern;
         let rest = b * b + c * c + d * d;
@@ -300,7 +300,7 @@ impl Header {
                 "correct the header's qform",
             ));
         }
-        // Rounding to f32 may leave (b, c, d) a little longer than 1; then a is 0, as in
+        // Rounding to f32 may leave (b, c, d) slightly longer than 1; then a is 0, as in
         // nifti1_io.c.
         let (a, b, c, d) = if rest > 1.0 - 1e-7 {
             let s = 1.0 / rest.sqrt();
@@ -315,9 +315,9 @@ impl Header {
         ))
     }
 
-    /// The header's slope and intercept after the map of the stored codes.
+    /// Returns the map from codes to values: `stored`, then the header's slope and intercept.
     fn value_map(&self, stored: ValueMap) -> ValueMap {
-        // "If the scl_slope field is nonzero" (nifti1.h); NaN is how SPM says none.
+        // "If the scl_slope field is nonzero" (nifti1.h); SPM writes NaN for none.
         if self.slope == 0.0 || !self.slope.is_finite() {
             return stored;
         }

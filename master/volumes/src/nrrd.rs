@@ -1,13 +1,13 @@
-//! NRRD, attached (`.nrrd`) and detached (`.nhdr` over one data file, or a list of them).
+//! Reader of NRRD, attached (`.nrrd`) and detached (`.nhdr` with one data file or a list of them).
 //!
-//! The format is told at teem.sourceforge.net/nrrd/format.html. A header is lines of
-//! `field: value`, `key:=value` and `# comment` up to an empty line. We collect the fields
-//! first and interpret them afterwards, in no particular order, which reads every file that
+//! Specification: teem.sourceforge.net/nrrd/format.html. A header is lines of `field: value`,
+//! `key:=value` and `# comment` up to an empty line. The reader collects the fields first and
+//! interprets them afterwards, so that their order does not matter. This accepts every file that
 //! the specification allows and some that it doesn't (fields before `dimension`).
 //!
 //! All encodings but `zrl` are read (`unpack`).
 
-use crate::data::{self, Form, HeaderLines, Skip};
+use crate::data::{self, HeaderLines, Skip, Storage};
 use crate::error::{Problem, quoted};
 use crate::samples::{Endian, Layout, Number};
 use crate::source::Source;
@@ -17,44 +17,47 @@ use slabcast_common::volume::{Lattice, Volume};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// What an NRRD file starts with, before its version.
+/// First bytes of an NRRD file, before its version.
 pub(crate) const MAGIC: &[u8] = b"NRRD";
 
-/// Most axes that teem knows (`NRRD_DIM_MAX`).
+/// Most axes, as in teem (`NRRD_DIM_MAX`).
 const AXES_MAX: usize = 16;
 
 const RESAVE: &str = "save it again with `encoding: gzip` or `encoding: raw`";
 
-/// Reads a volume from a source at its beginning. `folder` is where a detached header lies.
+/// Reads a volume from the start of a source. `folder` is the header's folder, where detached data
+/// must lie.
 pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volume, Problem> {
     let (fields, header_bytes) = Fields::read(&mut source)?;
-    let header = Header::of(&fields)?;
+    let header = Header::from_fields(&fields)?;
     let samples = match &header.data_files {
         None => {
             let len = source.len.saturating_sub(header_bytes);
-            data::read(source, len, &header.form, &header.layout)
+            data::read(source, len, &header.storage, &header.layout)
         }
-        Some(files) => data::read_files(folder, files, "data file", &header.form, &header.layout),
+        Some(files) => {
+            data::read_files(folder, files, "data file", &header.storage, &header.layout)
+        }
     };
     let (samples, map) = samples?;
     let file_type = header.layout.number.name();
     Ok(Volume::new(name, file_type, header.anatomical, header.lattice, samples, map))
 }
 
-/// The fields as written: name to line number and value.
+/// The header's fields: line number and value by name.
 struct Fields {
     lines: BTreeMap<String, (usize, String)>,
-    /// Names of data files, where `data file: LIST` announced them.
+    /// Names of data files after `data file: LIST`.
     list: Vec<String>,
 }
 
 impl Fields {
-    /// Reads the lines of a header; also says how many bytes they take.
+    /// Reads the lines of a header and returns their bytes with the fields.
     fn read(source: &mut Source) -> Result<(Fields, u64), Problem> {
         let mut fields = BTreeMap::new();
         let mut list = Vec::new();
         let mut in_list = false;
-        let mut header = HeaderLines::of(source, "end it with an empty line");
+        let mut header = HeaderLines::new(source, "end it with an empty line");
         // An empty line ends the header; so does the end of a detached one.
         while let Some((number, text)) = header.next()?.filter(|(n, t)| *n == 1 || !t.is_empty()) {
             let text = text.as_str();
@@ -79,7 +82,7 @@ impl Fields {
             if value.starts_with('=') {
                 continue;
             }
-            let name = canonical(&name.trim().to_ascii_lowercase());
+            let name = canonical_field(&name.trim().to_ascii_lowercase());
             if let Some((before, _)) = fields.get(&name) {
                 return Err(Problem::malformed(
                     format!("line {number}"),
@@ -87,11 +90,11 @@ impl Fields {
                     "remove one of them",
                 ));
             }
-            // File names follow, up to the end.
+            // File names follow up to the end of the header.
             in_list = name == "data file" && value.split_ascii_whitespace().next() == Some("LIST");
             fields.insert(name, (number, value.trim().to_string()));
         }
-        Ok((Fields { lines: fields, list }, header.consumed()))
+        Ok((Fields { lines: fields, list }, header.consumed_bytes()))
     }
 
     fn get(&self, name: &str) -> Option<&str> {
@@ -108,8 +111,8 @@ impl Fields {
         })
     }
 
-    /// The field's name with its line, for errors.
-    fn place(&self, name: &str) -> String {
+    /// Returns the field's name with its line, for error messages.
+    fn with_line(&self, name: &str) -> String {
         match self.lines.get(name) {
             Some((line, _)) => format!("{name} (line {line})"),
             None => name.to_string(),
@@ -118,10 +121,10 @@ impl Fields {
 
     fn malformed(&self, name: &str, why: &str, remedy: &str) -> Problem {
         let value = self.get(name).unwrap_or_default();
-        Problem::malformed(self.place(name), format!("{} {why}", quoted(value)), remedy)
+        Problem::malformed(self.with_line(name), format!("{} {why}", quoted(value)), remedy)
     }
 
-    /// One word for each axis.
+    /// Returns the words of a field, one for each axis; `None` if the field is absent.
     fn per_axis(&self, name: &str, axes: usize) -> Result<Option<Vec<&str>>, Problem> {
         let Some(value) = self.get(name) else { return Ok(None) };
         let words: Vec<&str> = value.split_ascii_whitespace().collect();
@@ -147,8 +150,8 @@ fn check_magic(line: &str) -> Result<(), Problem> {
     }
 }
 
-/// Fields that the specification lets be written in two ways.
-fn canonical(name: &str) -> String {
+/// Returns the usual spelling of a field that has two.
+fn canonical_field(name: &str) -> String {
     match name {
         "datafile" => "data file",
         "lineskip" => "line skip",
@@ -158,23 +161,23 @@ fn canonical(name: &str) -> String {
     .to_string()
 }
 
-/// A header that was understood.
+/// An interpreted header.
 struct Header {
     layout: Layout,
     lattice: Lattice,
     anatomical: bool,
-    form: Form,
+    storage: Storage,
     data_files: Option<Vec<String>>,
 }
 
 impl Header {
-    fn of(fields: &Fields) -> Result<Header, Problem> {
+    fn from_fields(fields: &Fields) -> Result<Header, Problem> {
         let number = number_type(fields)?;
         let encoding = encoding(fields)?;
         let endian = endian(fields, number, encoding)?;
-        let axes = Axes::of(fields)?;
-        let layout = Layout::new(axes.sizes, number, endian, &fields.place("sizes"))?;
-        let (lattice, anatomical) = place(fields, &axes, layout.dims)?;
+        let axes = Axes::from_fields(fields)?;
+        let layout = Layout::new(axes.sizes, number, endian, &fields.with_line("sizes"))?;
+        let (lattice, anatomical) = lattice(fields, &axes, layout.dims)?;
         let skip = |name: &str| match fields.get(name) {
             None => Ok(0),
             Some(text) => text.parse::<i64>().map_err(|_| {
@@ -191,8 +194,8 @@ impl Header {
                 })?),
             };
         let data_files = data_files(fields, &axes)?;
-        let form = Form { encoding, line_skip, byte_skip, skip_field: "byte skip" };
-        Ok(Header { layout, lattice, anatomical, form, data_files })
+        let storage = Storage { encoding, line_skip, byte_skip, skip_field: "byte skip" };
+        Ok(Header { layout, lattice, anatomical, storage, data_files })
     }
 }
 
@@ -220,7 +223,7 @@ fn number_type(fields: &Fields) -> Result<Number, Problem> {
         "double" => Number::F64,
         "block" => {
             return Err(Problem::unsupported(
-                fields.place("type"),
+                fields.with_line("type"),
                 "`block` samples are not numbers",
                 "save it as an integer or float type",
             ));
@@ -242,9 +245,13 @@ fn encoding(fields: &Fields) -> Result<Encoding, Problem> {
         "bz2" | "bzip2" => Encoding::Bzip2,
         "txt" | "text" | "ascii" => Encoding::Ascii,
         "hex" => Encoding::Hex,
-        // A scheme of teem's own that nothing else writes.
+        // Only teem writes this run-length encoding.
         "zrl" => {
-            return Err(Problem::unsupported(fields.place("encoding"), "zrl is not read", RESAVE));
+            return Err(Problem::unsupported(
+                fields.with_line("encoding"),
+                "zrl is not read",
+                RESAVE,
+            ));
         }
         _ => {
             return Err(fields.malformed(
@@ -270,8 +277,8 @@ fn endian(fields: &Fields, number: Number, encoding: Encoding) -> Result<Endian,
     }
 }
 
-/// The data files of a detached header: one, `LIST [dim]` with names in lines of their own, or
-/// `name%03d.raw min max step [dim]`.
+/// Returns the data files of a detached header: one name, `LIST [dim]` with a name on each
+/// following line, or `name%03d.raw min max step [dim]`.
 fn data_files(fields: &Fields, axes: &Axes) -> Result<Option<Vec<String>>, Problem> {
     let Some(value) = fields.get("data file") else { return Ok(None) };
     let words: Vec<&str> = value.split_ascii_whitespace().collect();
@@ -285,8 +292,8 @@ fn data_files(fields: &Fields, axes: &Axes) -> Result<Option<Vec<String>>, Probl
                 && pattern.contains('%')
                 && [min, max, step].iter().all(|w| w.parse::<i64>().is_ok()) =>
         {
-            let n = |w: &str| w.parse().expect("it was looked at");
-            match data::numbered(pattern, n(min), n(max), n(step)) {
+            let n = |w: &str| w.parse().expect("the guard parsed it");
+            match data::numbered_names(pattern, n(min), n(max), n(step)) {
                 Some(names) => (names, rest.first().copied()),
                 None => {
                     return bad(
@@ -304,13 +311,13 @@ fn data_files(fields: &Fields, axes: &Axes) -> Result<Option<Vec<String>>, Probl
         Some(Ok(dim)) if (1..=axes.all.len()).contains(&dim) => dim,
         Some(_) => return bad("ends in no number of axes", "give the axes that a file holds"),
     };
-    // A file may also hold a part of the last of its axes, as long as all hold the same.
+    // With dim = all axes, each file holds an equal part of the last axis.
     let whole = dim == axes.all.len();
     let want = axes.all[dim..].iter().try_fold(1u64, |n, &size| n.checked_mul(size));
     if names.is_empty() || !whole && want != Some(names.len() as u64) {
         let want = want.filter(|_| !whole).map_or("some".into(), |n| n.to_string());
         return Err(Problem::malformed(
-            fields.place("data file"),
+            fields.with_line("data file"),
             format!("names {} files where the sizes want {want}", names.len()),
             "correct the list, or the sizes",
         ));
@@ -318,19 +325,20 @@ fn data_files(fields: &Fields, axes: &Axes) -> Result<Option<Vec<String>>, Probl
     Ok(Some(names))
 }
 
-/// The three axes that are kept, out of those that the file has.
+/// The axes of the file, and the three that become the volume's.
 struct Axes {
-    /// Axes of the file.
+    /// Number of axes of the file.
     count: usize,
-    /// Which three, ascending.
+    /// Indices of the three kept axes, ascending.
     kept: [usize; 3],
+    /// Sizes of the kept axes.
     sizes: [u64; 3],
     /// Sizes of all axes of the file.
     all: Vec<u64>,
 }
 
 impl Axes {
-    fn of(fields: &Fields) -> Result<Axes, Problem> {
+    fn from_fields(fields: &Fields) -> Result<Axes, Problem> {
         let dimension = fields.required("dimension", "3")?;
         let count = match dimension.parse::<usize>() {
             Ok(n @ 1..=AXES_MAX) => n,
@@ -345,7 +353,7 @@ impl Axes {
                 fields.malformed("sizes", "has something else than whole numbers", "correct it")
             })?;
         let mut kept: Vec<usize> = (0..count).collect();
-        // Axes of one sample are dropped: first those that are said to be no axis of space.
+        // Drop axes of one sample, first those that the file marks as not spatial.
         let directions = match fields.get("space directions") {
             Some(_) => vectors(fields, "space directions", None)?,
             None => Vec::new(),
@@ -365,19 +373,19 @@ impl Axes {
                 .iter()
                 .rposition(|a| single(a) && outside_space(*a))
                 .or_else(|| kept.iter().rposition(single));
-            let Some(at) = dropped else {
+            let Some(index) = dropped else {
                 let list = sizes.iter().map(u64::to_string).collect::<Vec<_>>().join(" x ");
                 return Err(Problem::unsupported(
-                    fields.place("dimension"),
+                    fields.with_line("dimension"),
                     format!("{list} has {} axes of more than one sample", kept.len()),
                     "save one volume of it with three axes",
                 ));
             };
-            kept.remove(at);
+            kept.remove(index);
         }
         let Ok(kept) = <[usize; 3]>::try_from(kept) else {
             return Err(Problem::unsupported(
-                fields.place("dimension"),
+                fields.with_line("dimension"),
                 format!("{count} axes make no volume"),
                 "save it with three axes",
             ));
@@ -386,11 +394,11 @@ impl Axes {
     }
 }
 
-/// Where the samples lie, and whether that is said in anatomical axes.
-fn place(fields: &Fields, axes: &Axes, dims: [u32; 3]) -> Result<(Lattice, bool), Problem> {
+/// Returns the lattice in RAS+, and whether its axes are anatomical.
+fn lattice(fields: &Fields, axes: &Axes, dims: [u32; 3]) -> Result<(Lattice, bool), Problem> {
     let space = space(fields)?;
     let mut lattice = if fields.get("space directions").is_some() {
-        directed(fields, axes, dims)?
+        lattice_from_directions(fields, axes, dims)?
     } else {
         let spacings = fields.per_axis("spacings", axes.count)?;
         let mut spacing = [1.0; 3];
@@ -399,7 +407,7 @@ fn place(fields: &Fields, axes: &Axes, dims: [u32; 3]) -> Result<(Lattice, bool)
                 let x: f64 = words[axis].parse().map_err(|_| {
                     fields.malformed("spacings", "has something else than numbers", "correct it")
                 })?;
-                // NaN is the format's word for "unknown".
+                // The format writes NaN for "unknown".
                 spacing[a] = if x.is_nan() { 1.0 } else { x };
             }
         }
@@ -409,22 +417,26 @@ fn place(fields: &Fields, axes: &Axes, dims: [u32; 3]) -> Result<(Lattice, bool)
         }
         lattice
     };
-    // Only directions say where an axis points; a space alone says nothing of index axes.
+    // A space without directions does not say where the index axes point.
     let directed = fields.get("space directions").is_some();
     let space = space.filter(|_| directed);
     let (signs, anatomical) = space.map_or((DVec3::ONE, false), |s| (s.signs, s.anatomical));
     let scale = unit_mm(fields);
-    // `+ 0.0` makes of -0.0 a 0.0, so that a volume's digest does not depend on it.
+    // Adding zero turns -0.0 into 0.0, which the volume's digest would distinguish.
     lattice.steps = lattice.steps.map(|s| s * signs * scale + DVec3::ZERO);
     lattice.origin = lattice.origin * signs * scale + DVec3::ZERO;
     lattice.check().map_err(|e| {
         let field = if directed { "space directions" } else { "spacings" };
-        Problem::malformed(fields.place(field), e, "correct the axes")
+        Problem::malformed(fields.with_line(field), e, "correct the axes")
     })?;
     Ok((lattice, anatomical))
 }
 
-fn directed(fields: &Fields, axes: &Axes, dims: [u32; 3]) -> Result<Lattice, Problem> {
+fn lattice_from_directions(
+    fields: &Fields,
+    axes: &Axes,
+    dims: [u32; 3],
+) -> Result<Lattice, Problem> {
     let all = vectors(fields, "space directions", Some(axes.count))?;
     let mut steps = [DVec3::ZERO; 3];
     for (a, &axis) in axes.kept.iter().enumerate() {
@@ -446,7 +458,7 @@ fn origin(fields: &Fields) -> Result<Option<DVec3>, Problem> {
     Ok(vectors(fields, "space origin", Some(1))?[0])
 }
 
-/// `(1,0,0) none (0,0,1)`.
+/// Parses vectors such as `(1,0,0) none (0,0,1)`; `count` is how many there must be.
 fn vectors(
     fields: &Fields,
     name: &str,
@@ -482,7 +494,7 @@ fn vectors(
     Ok(found)
 }
 
-/// A space by its signs on the way to RAS+.
+/// A space of the format: the signs of its axes in RAS+, and whether they are anatomical.
 #[derive(Clone, Copy)]
 struct Space {
     signs: DVec3,
@@ -505,11 +517,11 @@ fn space(fields: &Fields) -> Result<Option<Space>, Problem> {
         "left-anterior-superior" | "las" => anatomical(-1.0, 1.0, 1.0),
         "left-posterior-superior" | "lps" => anatomical(-1.0, -1.0, 1.0),
         "scanner-xyz" | "3d-right-handed" => Some(Space { signs: DVec3::ONE, anatomical: false }),
-        // The world is right-handed: as it stands, it would be drawn mirrored.
+        // The world is right-handed: without the sign it would be drawn mirrored.
         "3d-left-handed" => Some(Space { signs: DVec3::new(1.0, 1.0, -1.0), anatomical: false }),
         other if other.ends_with("-time") || matches!(other, "rast" | "last" | "lpst") => {
             return Err(Problem::unsupported(
-                fields.place("space"),
+                fields.with_line("space"),
                 format!("{} has four dimensions", quoted(name)),
                 "save one time step in a space of three",
             ));
@@ -524,7 +536,7 @@ fn space(fields: &Fields) -> Result<Option<Space>, Problem> {
     })
 }
 
-/// Millimetres of one unit, where the file names the same known unit for all its axes.
+/// Returns the millimetres of one unit of length; 1 unless all axes have the same known unit.
 fn unit_mm(fields: &Fields) -> f64 {
     let units = fields.get("space units").or_else(|| fields.get("units")).unwrap_or_default();
     let mut units = units.split_ascii_whitespace().map(|u| match u.trim_matches('"') {

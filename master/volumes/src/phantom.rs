@@ -1,47 +1,47 @@
-//! A phantom of which no two voxels are alike, written in every format and along several axes:
-//! each must be read with right at the right.
+//! Tests orientation with a phantom whose voxels all differ, written in every format and several
+//! axis orders. Each must be read with the patient's right at the right.
 //!
-//! Its value at world (x, y, z) is `1 + x + 10 y + 100 z`, in RAS+: x grows to the patient's
-//! right. What each format's words mean is written out by hand here, not taken from the readers.
+//! The value at world (x, y, z) is `1 + x + 10 y + 100 z` in RAS+, where x grows to the patient's
+//! right. The meaning of each format's fields is written out by hand, not taken from the readers.
 
 use crate::Hints;
 use crate::source::Source;
 use slabcast_common::volume::Volume;
 use std::path::Path;
 
-/// Three voxels to the right, four to anterior, five to superior.
+/// Voxels to the right, to anterior and to superior.
 const SIZE: [i64; 3] = [3, 4, 5];
 
 fn value([x, y, z]: [i64; 3]) -> i16 {
     (1 + x + 10 * y + 100 * z) as i16
 }
 
-/// How a file runs through the body: for i, j, k the world axis and whether it runs up it.
+/// Order of a file's samples: for i, j, k the world axis, and whether it ascends.
 #[derive(Clone, Copy, Debug)]
-struct Run([(usize, bool); 3]);
+struct AxisOrder([(usize, bool); 3]);
 
-/// Left to right first; as scanners write it, right to left and front to back; sagittal slices.
-const RUNS: [Run; 3] = [
-    Run([(0, true), (1, true), (2, true)]),
-    Run([(0, false), (1, false), (2, true)]),
-    Run([(1, false), (2, false), (0, true)]),
+/// Left to right; right to left and front to back, as scanners write; sagittal slices.
+const ORDERS: [AxisOrder; 3] = [
+    AxisOrder([(0, true), (1, true), (2, true)]),
+    AxisOrder([(0, false), (1, false), (2, true)]),
+    AxisOrder([(1, false), (2, false), (0, true)]),
 ];
 
-impl Run {
+impl AxisOrder {
     fn dims(self) -> [i64; 3] {
         self.0.map(|(axis, _)| SIZE[axis])
     }
 
-    /// World index of the sample (i, j, k).
-    fn world(self, at: [i64; 3]) -> [i64; 3] {
+    /// Returns the world index of the sample (i, j, k).
+    fn world(self, index: [i64; 3]) -> [i64; 3] {
         let mut world = [0; 3];
         for (a, (axis, up)) in self.0.into_iter().enumerate() {
-            world[axis] = if up { at[a] } else { SIZE[axis] - 1 - at[a] };
+            world[axis] = if up { index[a] } else { SIZE[axis] - 1 - index[a] };
         }
         world
     }
 
-    /// The direction of an index axis in RAS+.
+    /// Returns the direction of an index axis in RAS+.
     fn step(self, a: usize) -> [i64; 3] {
         let (axis, up) = self.0[a];
         let mut step = [0; 3];
@@ -65,7 +65,7 @@ impl Run {
     }
 }
 
-/// LPS from RAS and back.
+/// Converts between RAS and LPS.
 fn lps([x, y, z]: [i64; 3]) -> [i64; 3] {
     [-x, -y, z]
 }
@@ -93,16 +93,16 @@ fn check(v: &Volume, what: &str) {
 
 #[track_caller]
 fn open(bytes: Vec<u8>, name: &str) -> Volume {
-    crate::read(Source::memory(bytes), Path::new("."), name, &Hints::default())
+    crate::read(Source::from_bytes(bytes), Path::new("."), name, &Hints::default())
         .unwrap_or_else(|e| panic!("{name}: {e}"))
 }
 
 #[test]
-fn anatomical_formats_put_right_at_the_right() {
-    for run in RUNS {
-        let [ni, nj, nk] = run.dims();
-        let (steps, first) = ([0, 1, 2].map(|a| run.step(a)), run.world([0; 3]));
-        let data = run.bytes();
+fn orientation_of_anatomical_formats_is_ras() {
+    for order in ORDERS {
+        let [ni, nj, nk] = order.dims();
+        let (steps, first) = ([0, 1, 2].map(|a| order.step(a)), order.world([0; 3]));
+        let data = order.bytes();
         let vectors = |v: [[i64; 3]; 3]| v.map(|v| format!("({})", words(v, ","))).join(" ");
         for (space, turn) in [
             ("right-anterior-superior", (|v| v) as fn([i64; 3]) -> [i64; 3]),
@@ -128,8 +128,8 @@ fn anatomical_formats_put_right_at_the_right() {
         let v = open([head.as_bytes(), &data].concat(), "v.mha");
         assert!(v.anatomical);
         check(&v, "MetaImage");
-        check(&open(nifti(run, &data), "v.nii"), "NIfTI sform");
-        // What we write ourselves.
+        check(&open(nifti(order, &data), "v.nii"), "NIfTI sform");
+        // Our own writer's files.
         for name in ["v.nrrd", "v.nii", "v.nii.gz"] {
             let mut bytes = Vec::new();
             let format = crate::write::Format::from_name(name).unwrap();
@@ -141,8 +141,8 @@ fn anatomical_formats_put_right_at_the_right() {
     }
 }
 
-/// A NIfTI-1 file with an sform.
-fn nifti(run: Run, data: &[u8]) -> Vec<u8> {
+/// Returns a NIfTI-1 file with an sform.
+fn nifti(order: AxisOrder, data: &[u8]) -> Vec<u8> {
     let mut b = vec![0u8; 352];
     let mut put = |at: usize, bytes: &[u8]| b[at..at + bytes.len()].copy_from_slice(bytes);
     put(0, &348i32.to_le_bytes());
@@ -151,12 +151,12 @@ fn nifti(run: Run, data: &[u8]) -> Vec<u8> {
     put(108, &352f32.to_le_bytes());
     put(254, &1i16.to_le_bytes());
     put(344, b"n+1\0");
-    let first = run.world([0; 3]);
+    let first = order.world([0; 3]);
     for a in 0..3 {
-        put(42 + 2 * a, &(run.dims()[a] as i16).to_le_bytes());
+        put(42 + 2 * a, &(order.dims()[a] as i16).to_le_bytes());
         put(80 + 4 * a, &1f32.to_le_bytes());
         for c in 0..3 {
-            put(280 + 16 * a + 4 * c, &(run.step(c)[a] as f32).to_le_bytes());
+            put(280 + 16 * a + 4 * c, &(order.step(c)[a] as f32).to_le_bytes());
         }
         put(280 + 16 * a + 12, &(first[a] as f32).to_le_bytes());
     }
@@ -166,25 +166,28 @@ fn nifti(run: Run, data: &[u8]) -> Vec<u8> {
 
 #[cfg(feature = "dicom")]
 #[test]
-fn dicom_puts_right_at_the_right_whatever_its_slices_are_called() {
+fn orientation_of_dicom_ignores_file_names() {
     use crate::dicom::tests::{ALL, slice};
-    for (n, run) in RUNS.into_iter().enumerate().filter(|(_, r)| r.dims()[0] == 3) {
+    for (n, order) in ORDERS.into_iter().enumerate().filter(|(_, r)| r.dims()[0] == 3) {
         for syntax in ALL {
             let dir = tempfile::tempdir().unwrap();
-            let [ni, nj, nk] = run.dims();
-            let samples = run.samples();
+            let [ni, nj, nk] = order.dims();
+            let samples = order.samples();
             for k in 0..nk {
                 let pixels = &samples[(k * ni * nj) as usize..((k + 1) * ni * nj) as usize];
-                let orientation =
-                    format!("{}\\{}", words(lps(run.step(0)), "\\"), words(lps(run.step(1)), "\\"));
-                let position = words(lps(run.world([0, 0, k])), "\\");
+                let orientation = format!(
+                    "{}\\{}",
+                    words(lps(order.step(0)), "\\"),
+                    words(lps(order.step(1)), "\\")
+                );
+                let position = words(lps(order.world([0, 0, k])), "\\");
                 let more = [
                     ("orientation", orientation.as_str()),
                     ("position", position.as_str()),
                     ("pixel_spacing", "1\\1"),
                     ("intercept", "0"),
                 ];
-                // Names run against space.
+                // File names descend where positions ascend.
                 let name = format!("{:03}.dcm", 99 - k);
                 std::fs::write(dir.path().join(name), slice(syntax, "1.2", 0.0, pixels, &more))
                     .unwrap();
@@ -196,16 +199,16 @@ fn dicom_puts_right_at_the_right_whatever_its_slices_are_called() {
     }
 }
 
-/// Formats that know no body: index axes are x, y, z.
+/// Formats without anatomical axes: index axes are x, y, z.
 #[test]
-fn formats_without_anatomy_keep_the_order_of_their_axes() {
-    let run = RUNS[0];
-    let [ni, nj, nk] = run.dims();
-    check(&open(run.bytes(), "v_3x4x5_int16.raw"), "raw");
-    let text: Vec<String> = run.samples().iter().map(i16::to_string).collect();
-    let vti = |direction: &str, origin: &str, run: Run| {
-        let [ni, nj, nk] = run.dims().map(|n| n - 1);
-        let text: Vec<String> = run.samples().iter().map(i16::to_string).collect();
+fn orientation_of_formats_without_anatomy_is_the_index_order() {
+    let order = ORDERS[0];
+    let [ni, nj, nk] = order.dims();
+    check(&open(order.bytes(), "v_3x4x5_int16.raw"), "raw");
+    let text: Vec<String> = order.samples().iter().map(i16::to_string).collect();
+    let vti = |direction: &str, origin: &str, order: AxisOrder| {
+        let [ni, nj, nk] = order.dims().map(|n| n - 1);
+        let text: Vec<String> = order.samples().iter().map(i16::to_string).collect();
         format!(
             "<VTKFile type=\"ImageData\"><ImageData WholeExtent=\"0 {ni} 0 {nj} 0 {nk}\" \
              Origin=\"{origin}\" Spacing=\"1 1 1\" Direction=\"{direction}\"><Piece><PointData>\
@@ -213,9 +216,9 @@ fn formats_without_anatomy_keep_the_order_of_their_axes() {
             text.join(" ")
         )
     };
-    check(&open(vti("1 0 0 0 1 0 0 0 1", "0 0 0", run).into(), "v.vti"), "VTI");
-    // Columns of Direction are where i, j and k run.
-    let sagittal = RUNS[2];
+    check(&open(vti("1 0 0 0 1 0 0 0 1", "0 0 0", order).into(), "v.vti"), "VTI");
+    // Columns of Direction are the directions of i, j and k.
+    let sagittal = ORDERS[2];
     let at = sagittal.world([0; 3]);
     let turned = vti("0 0 1 -1 0 0 0 -1 0", &words(at, " "), sagittal);
     check(&open(turned.into(), "v.vti"), "VTI with directions");
@@ -226,7 +229,7 @@ fn formats_without_anatomy_keep_the_order_of_their_axes() {
     check(&open(nrrd.into(), "v.nrrd"), "NRRD without a space");
     let mut tiff_bytes = std::io::Cursor::new(Vec::new());
     let mut tiff = tiff::encoder::TiffEncoder::new(&mut tiff_bytes).unwrap();
-    for page in run.samples().chunks((ni * nj) as usize) {
+    for page in order.samples().chunks((ni * nj) as usize) {
         tiff.write_image::<tiff::encoder::colortype::GrayI16>(ni as u32, nj as u32, page).unwrap();
     }
     check(&open(tiff_bytes.into_inner(), "v.tif"), "TIFF");

@@ -1,8 +1,8 @@
-//! Reader of raw numbers without a header. Size and type come from flags or from the file's name, as
-//! in `head_256x256x256_uint8.raw`. Where they do not match the file's length, the error suggests
-//! flags that would.
+//! Reader of raw numbers without a header. Size and type come from flags or from the file's name,
+//! as in `head_256x256x256_uint8.raw`. Where they do not match the file's length, the error
+//! suggests flags that would.
 
-use crate::data::{self, Form, Skip};
+use crate::data::{self, Skip, Storage};
 use crate::error::{OpenErrorKind, Problem};
 use crate::samples::{Endian, Layout, Number};
 use crate::source::Source;
@@ -140,13 +140,13 @@ pub(crate) fn read(
     }
     let lattice = Lattice::from_spacing(layout.dims, known.spacing.unwrap_or([1.0; 3]));
     lattice.check().map_err(|e| Problem::malformed("--spacing", e, "give three lengths"))?;
-    let form = Form {
+    let storage = Storage {
         encoding: if gzip { Encoding::Gzip } else { Encoding::Raw },
         line_skip: 0,
         byte_skip: Skip::Bytes(skip),
         skip_field: "--skip",
     };
-    let (samples, map) = data::read(source, len, &form, &layout)?;
+    let (samples, map) = data::read(source, len, &storage, &layout)?;
     Ok(Volume::new(name, number.name(), false, lattice, samples, map))
 }
 

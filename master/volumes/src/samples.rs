@@ -1,6 +1,6 @@
-//! From a file's numbers to [`Samples`]: every type and byte order, at a stranger's word.
+//! Converts a file's numbers, of any type and byte order, to [`Samples`].
 //!
-//! What is kept, and why:
+//! How each type is kept:
 //!
 //! | file | codes | value of code c |
 //! |---|---|---|
@@ -11,8 +11,8 @@
 //! | float64 that f32 holds well | f32 | c |
 //! | other float64 | f32 in 0..1 | min + c (max - min) |
 //!
-//! A 32-bit integer with a wide range loses its low bits (f32 has 24); so does every renderer
-//! that samples floats. What it must not lose is the span, hence the shift by the minimum.
+//! A 32-bit integer with a wide range loses its low bits (f32 has 24), as in every renderer that
+//! samples floats. The shift by the minimum keeps the span.
 
 use crate::error::{OpenErrorKind, Problem};
 use crate::wide;
@@ -22,23 +22,23 @@ use std::io::Read;
 use std::panic::AssertUnwindSafe;
 use std::sync::mpsc;
 
-/// Largest size along one axis. A header that asks for more is far likelier wrong than large:
-/// with [`SAMPLES_MAX`] the other two would average below 724.
+/// Most samples along an axis. A header that asks for more is likelier wrong than large: with
+/// [`SAMPLES_MAX`] the other two axes would average below 724.
 pub(crate) const DIM_MAX: u64 = 16384;
-/// Most samples: 2048^3, 8 GiB of 8-bit codes. Larger ones want bricks read on demand.
+/// Most samples of a volume: 2048^3, 8 GiB of 8-bit codes. More would need bricks read on demand.
 pub(crate) const SAMPLES_MAX: u64 = 1 << 33;
-/// Most bytes that are inflated only to be dropped (NIfTI extensions, a byte skip inside gzip).
-/// Dense deflate gives 240 MB/s (`examples/load` on 64 MiB of noise in 4 bits: 0.27 s), so this
-/// is 0.07 s of the 0.1 s that docs/design/promises.md R13 allows a file that turns out bad.
+/// Most bytes that are inflated only to be skipped (NIfTI extensions, a byte skip inside gzip).
+/// Dense deflate decodes 240 MB/s (`examples/load` on 64 MiB of noise in 4 bits: 0.27 s), so this
+/// is 0.07 s of the 0.1 s that docs/design/promises.md R13 allows for refusing a file.
 pub(crate) const SKIP_MAX_BYTES: u64 = 16 << 20;
-/// Bytes decoded at a time; a multiple of every type's size. Fits the second-level cache.
+/// Bytes decoded at a time: a multiple of every type's size that fits the second-level cache.
 const CHUNK_BYTES: usize = 128 << 10;
-/// Chunks that are unpacked ahead: half a megabyte.
-const AHEAD: usize = 4;
-/// From so many bytes on a thread is worth its start: at 240 MB/s they take 9 ms to unpack.
-const AHEAD_FROM_BYTES: u64 = 2 << 20;
+/// Chunks that the decompressing thread may be ahead: half a megabyte.
+const CHUNKS_AHEAD: usize = 4;
+/// Least size of samples that are decompressed in a thread of their own: 9 ms at 240 MB/s.
+const THREAD_MIN_BYTES: u64 = 2 << 20;
 
-/// A number's type in a file.
+/// Type of a sample in a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Number {
     U8,
@@ -54,6 +54,7 @@ pub(crate) enum Number {
 }
 
 impl Number {
+    /// Returns the size of a number in bytes.
     pub(crate) fn bytes(self) -> u64 {
         match self {
             Number::U8 | Number::I8 => 1,
@@ -63,7 +64,7 @@ impl Number {
         }
     }
 
-    /// Integers, the smaller first, unsigned before signed.
+    /// Integer types, the smaller first, unsigned before signed.
     pub(crate) const INTEGERS: [Number; 8] = [
         Number::U8,
         Number::I8,
@@ -75,7 +76,7 @@ impl Number {
         Number::I64,
     ];
 
-    /// Smallest and largest value of an integer type.
+    /// Returns the smallest and largest value of an integer type; `None` for floats.
     pub(crate) fn limits(self) -> Option<(f64, f64)> {
         Some(match self {
             Number::U8 => (0.0, u8::MAX.into()),
@@ -90,7 +91,7 @@ impl Number {
         })
     }
 
-    /// Its name for people.
+    /// Returns the type's name, such as `uint8`.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Number::U8 => "uint8",
@@ -107,41 +108,41 @@ impl Number {
     }
 }
 
-/// Which end of a number comes first.
+/// Byte order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Endian {
     Little,
     Big,
 }
 
-/// What is behind a reader.
+/// How many bytes of samples a reader can have, known before it is read.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Supply {
-    /// This many bytes are there.
+    /// Uncompressed samples.
     Plain {
-        /// Bytes from the first sample on.
+        /// Bytes of the file from the first sample on.
         have: u64,
     },
-    /// Samples that come out of other bytes: packed, or written as text.
+    /// Compressed samples, or samples written as text.
     Encoded {
-        /// What the encoding is called.
+        /// Name of the encoding.
         name: &'static str,
-        /// Bytes of the file from its start on, at most.
+        /// Most bytes of the file that hold samples.
         bytes: u64,
-        /// Bytes that one of them can at most become.
+        /// Most bytes of samples per byte of the file.
         ratio: u64,
     },
 }
 
 impl Supply {
-    /// A deflate stream, with the header of gzip or of zlib: a match of 258 bytes takes at least
-    /// two bits. Lets a liar be refused before anything is inflated.
+    /// Returns the supply of a deflate stream in gzip or zlib. A match of 258 bytes takes at least
+    /// two bits, so a false size is refused before anything is inflated.
     pub(crate) fn deflate(name: &'static str, bytes: u64) -> Supply {
         Supply::Encoded { name, bytes, ratio: 1032 }
     }
 }
 
-/// What a header says of its samples; the sizes are checked.
+/// Sizes, type and byte order of the samples, with sizes within the limits.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Layout {
     pub(crate) dims: [u32; 3],
@@ -150,7 +151,7 @@ pub(crate) struct Layout {
 }
 
 impl Layout {
-    /// Checks sizes against the limits. `field` names them in the file's words.
+    /// Checks the sizes against the limits. `field` is the file's name for them.
     pub(crate) fn new(
         dims: [u64; 3],
         number: Number,
@@ -195,14 +196,14 @@ impl Layout {
         self.dims.iter().map(|&n| n as usize).product()
     }
 
-    /// Bytes of the samples in the file, uncompressed.
+    /// Returns the size of the uncompressed samples, in bytes.
     pub(crate) fn bytes(&self) -> u64 {
         self.count() as u64 * self.number.bytes()
     }
 }
 
-/// Reads the samples. Takes memory only as far as bytes are known to be there; a gzip stream is
-/// followed to its declared size and one byte more.
+/// Reads the samples. Takes memory only for bytes that are known to exist. Reads compressed data
+/// one byte past the declared size, to find surplus data and wrong checksums.
 pub(crate) fn read(
     reader: &mut (dyn Read + Send),
     supply: Supply,
@@ -210,7 +211,7 @@ pub(crate) fn read(
 ) -> Result<(Samples, ValueMap), Problem> {
     let need = layout.bytes();
     match supply {
-        Supply::Plain { have } if have < need => return Err(short(need, have)),
+        Supply::Plain { have } if have < need => return Err(truncated(need, have)),
         Supply::Encoded { name, bytes, ratio } if need / ratio > bytes => {
             return Err(Problem::new(
                 OpenErrorKind::Damaged,
@@ -224,8 +225,8 @@ pub(crate) fn read(
         }
         _ => {}
     }
-    let bytes = Bytes { reader, supply, need, before: 0 };
-    let mut data = Data { bytes, size: layout.number.bytes() as usize };
+    let bytes = ByteReader { reader, supply, need, received: 0 };
+    let mut data = NumberReader { bytes, size: layout.number.bytes() as usize };
     let big = layout.endian == Endian::Big;
     macro_rules! words {
         ($t:ty) => {
@@ -239,7 +240,7 @@ pub(crate) fn read(
             }
         };
     }
-    // Flipping the top bit adds half the range.
+    // Flipping the top bit of a signed number adds half its range.
     let shifted = |offset| ValueMap { scale: 1.0, offset };
     Ok(match layout.number {
         Number::U8 => {
@@ -253,29 +254,30 @@ pub(crate) fn read(
         Number::U16 => (Samples::U16(data.collect(words!(u16))?), ValueMap::IDENTITY),
         Number::I16 => {
             let v = data.collect(|bytes, out| {
-                let from = out.len();
+                let first = out.len();
                 words!(u16)(bytes, out);
-                out[from..].iter_mut().for_each(|x| *x ^= 0x8000);
+                out[first..].iter_mut().for_each(|x| *x ^= 0x8000);
             })?;
             (Samples::U16(v), shifted(-32768.0))
         }
         Number::F32 => (Samples::F32(data.collect(words!(f32))?), ValueMap::IDENTITY),
-        Number::U32 => wide::narrow(data.pieces(words!(u32))?, i128::from)?,
-        Number::I32 => wide::narrow(data.pieces(words!(i32))?, i128::from)?,
-        Number::U64 => wide::narrow(data.pieces(words!(u64))?, i128::from)?,
-        Number::I64 => wide::narrow(data.pieces(words!(i64))?, i128::from)?,
-        Number::F64 => wide::single(data.pieces(words!(f64))?)?,
+        Number::U32 => wide::compact_integers(data.collect_pieces(words!(u32))?, i128::from)?,
+        Number::I32 => wide::compact_integers(data.collect_pieces(words!(i32))?, i128::from)?,
+        Number::U64 => wide::compact_integers(data.collect_pieces(words!(u64))?, i128::from)?,
+        Number::I64 => wide::compact_integers(data.collect_pieces(words!(i64))?, i128::from)?,
+        Number::F64 => wide::compact_doubles(data.collect_pieces(words!(f64))?)?,
     })
 }
 
-struct Data<'a> {
-    bytes: Bytes<'a>,
+/// Decodes numbers of one size.
+struct NumberReader<'a> {
+    bytes: ByteReader<'a>,
     /// Bytes of a number.
     size: usize,
 }
 
-impl Data<'_> {
-    /// All numbers in one list.
+impl NumberReader<'_> {
+    /// Returns all numbers in one list.
     fn collect<T>(&mut self, decode: impl Fn(&[u8], &mut Vec<T>)) -> Result<Vec<T>, Problem> {
         let count = (self.bytes.need / self.size as u64) as usize;
         let mut out = Vec::new();
@@ -283,10 +285,10 @@ impl Data<'_> {
             reserve(&mut out, count)?;
         }
         let size = self.size;
-        self.each(|bytes| {
+        self.for_each_chunk(|bytes| {
             let numbers = bytes.len() / size;
             if out.capacity() - out.len() < numbers {
-                // Never more than twice of what has come, nor more than was declared.
+                // At most twice the numbers received, and no more than declared.
                 let room = (2 * (out.len() + numbers)).min(count) - out.len();
                 reserve(&mut out, room)?;
             }
@@ -296,17 +298,20 @@ impl Data<'_> {
         Ok(out)
     }
 
-    /// All numbers in pieces, which [`wide`] gives back one by one.
-    fn pieces<T>(&mut self, decode: impl Fn(&[u8], &mut Vec<T>)) -> Result<Vec<Vec<T>>, Problem> {
+    /// Returns all numbers in pieces, which [`wide`] frees one by one.
+    fn collect_pieces<T>(
+        &mut self,
+        decode: impl Fn(&[u8], &mut Vec<T>),
+    ) -> Result<Vec<Vec<T>>, Problem> {
         let mut pieces: Vec<Vec<T>> = Vec::new();
         let (size, mut left) = (self.size, (self.bytes.need / self.size as u64) as usize);
-        self.each(|bytes| {
+        self.for_each_chunk(|bytes| {
             let numbers = bytes.len() / size;
             let full = |p: &Vec<T>| p.len() * size >= wide::PIECE_BYTES;
             if pieces.last().is_none_or(full) {
                 pieces.push(Vec::new());
             }
-            let piece = pieces.last_mut().expect("one was put there");
+            let piece = pieces.last_mut().expect("pushed above");
             if piece.capacity() - piece.len() < numbers {
                 let most = left.min(wide::PIECE_BYTES / size - piece.len());
                 reserve(piece, (piece.len() + 2 * numbers).min(most).max(numbers))?;
@@ -318,11 +323,14 @@ impl Data<'_> {
         Ok(pieces)
     }
 
-    /// All bytes, in chunks that end between numbers. A large packed file is unpacked by a thread
-    /// of its own, some chunks ahead of whoever takes them.
-    fn each(&mut self, mut take: impl FnMut(&[u8]) -> Result<(), Problem>) -> Result<(), Problem> {
+    /// Calls `take` with all bytes, in chunks that end between numbers. A thread of its own
+    /// decompresses large data, up to [`CHUNKS_AHEAD`] chunks ahead.
+    fn for_each_chunk(
+        &mut self,
+        mut take: impl FnMut(&[u8]) -> Result<(), Problem>,
+    ) -> Result<(), Problem> {
         let bytes = &mut self.bytes;
-        if matches!(bytes.supply, Supply::Plain { .. }) || bytes.need < AHEAD_FROM_BYTES {
+        if matches!(bytes.supply, Supply::Plain { .. }) || bytes.need < THREAD_MIN_BYTES {
             let mut chunk = Vec::new();
             while bytes.next(&mut chunk)? {
                 take(&chunk)?;
@@ -330,26 +338,26 @@ impl Data<'_> {
             return Ok(());
         }
         std::thread::scope(|scope| {
-            let (filled, chunks) = mpsc::sync_channel(AHEAD);
+            let (filled, chunks) = mpsc::sync_channel(CHUNKS_AHEAD);
             let (used, spare) = mpsc::channel::<Vec<u8>>();
-            let ahead = move || {
+            let decompress = move || {
                 loop {
                     let mut chunk = spare.try_recv().unwrap_or_default();
-                    // A panic comes out as a problem: the scope would pass it on to whoever opens
-                    // the file.
+                    // A panic becomes an error of the file; the scope would propagate it to the
+                    // caller.
                     let next = AssertUnwindSafe(|| bytes.next(&mut chunk));
                     let next = std::panic::catch_unwind(next)
                         .unwrap_or_else(|panic| Err(Problem::panicked("data", &*panic)))
                         .map(|more| more.then_some(chunk));
                     let last = !matches!(next, Ok(Some(_)));
-                    // Nobody listens any more after a problem at the other end.
+                    // The receiver is gone after an error of its own.
                     if filled.send(next).is_err() || last {
                         return;
                     }
                 }
             };
-            let named = std::thread::Builder::new().name("slabcast-unpack".into());
-            named.spawn_scoped(scope, ahead).map_err(|e| Problem::io("data", &e))?;
+            let builder = std::thread::Builder::new().name("slabcast-unpack".into());
+            builder.spawn_scoped(scope, decompress).map_err(|e| Problem::io("data", &e))?;
             while let Ok(next) = chunks.recv() {
                 let Some(chunk) = next? else { break };
                 take(&chunk)?;
@@ -360,47 +368,47 @@ impl Data<'_> {
     }
 }
 
-/// The bytes of all numbers, as they come.
-struct Bytes<'a> {
+/// Reads exactly the bytes that the layout needs, in chunks.
+struct ByteReader<'a> {
     reader: &'a mut (dyn Read + Send),
     supply: Supply,
     need: u64,
-    /// Bytes that came already.
-    before: u64,
+    /// Bytes read so far.
+    received: u64,
 }
 
-impl Bytes<'_> {
-    /// The next bytes into `chunk`; false at the end, which is where it should be.
+impl ByteReader<'_> {
+    /// Reads the next bytes into `chunk`; false after the last, whose end is checked.
     fn next(&mut self, chunk: &mut Vec<u8>) -> Result<bool, Problem> {
-        if self.before == self.need {
+        if self.received == self.need {
             if matches!(self.supply, Supply::Encoded { .. }) {
-                self.end()?;
+                self.check_end()?;
             }
             return Ok(false);
         }
-        chunk.resize((CHUNK_BYTES as u64).min(self.need - self.before) as usize, 0);
+        chunk.resize((CHUNK_BYTES as u64).min(self.need - self.received) as usize, 0);
         self.fill(chunk)?;
-        self.before += chunk.len() as u64;
+        self.received += chunk.len() as u64;
         Ok(true)
     }
 
-    /// Fills `chunk` or says what is missing.
+    /// Fills `chunk`, or fails with the bytes that are missing.
     fn fill(&mut self, chunk: &mut [u8]) -> Result<(), Problem> {
-        let (before, mut at) = (self.before, 0);
-        while at < chunk.len() {
-            match self.reader.read(&mut chunk[at..]) {
-                Ok(0) => return Err(short(self.need, before + at as u64)),
-                Ok(n) => at += n,
+        let (received, mut filled) = (self.received, 0);
+        while filled < chunk.len() {
+            match self.reader.read(&mut chunk[filled..]) {
+                Ok(0) => return Err(truncated(self.need, received + filled as u64)),
+                Ok(n) => filled += n,
                 Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
-                Err(e) => return Err(self.broken(&e, before + at as u64)),
+                Err(e) => return Err(self.read_problem(&e, received + filled as u64)),
             }
         }
         Ok(())
     }
 
-    /// One byte past the declared size: none may come, and a packed stream checks its sum on the
-    /// way.
-    fn end(&mut self) -> Result<(), Problem> {
+    /// Tries to read one byte past the declared size: there must be none. On the way a compressed
+    /// stream verifies its checksum.
+    fn check_end(&mut self) -> Result<(), Problem> {
         loop {
             match self.reader.read(&mut [0]) {
                 Ok(0) => return Ok(()),
@@ -413,18 +421,20 @@ impl Bytes<'_> {
                     ));
                 }
                 Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
-                Err(e) => return Err(self.broken(&e, self.need)),
+                Err(e) => return Err(self.read_problem(&e, self.need)),
             }
         }
     }
 
-    fn broken(&self, e: &std::io::Error, have: u64) -> Problem {
-        // What our own readers say travels inside the error as it is.
+    fn read_problem(&self, e: &std::io::Error, have: u64) -> Problem {
+        // Our own readers wrap a problem in the error; pass it on unchanged.
         if let Some(problem) = e.get_ref().and_then(|inner| inner.downcast_ref::<Problem>()) {
             return problem.clone();
         }
         match (self.supply, e.kind()) {
-            (Supply::Encoded { .. }, std::io::ErrorKind::UnexpectedEof) => short(self.need, have),
+            (Supply::Encoded { .. }, std::io::ErrorKind::UnexpectedEof) => {
+                truncated(self.need, have)
+            }
             (Supply::Encoded { name, .. }, _) => Problem::new(
                 OpenErrorKind::Damaged,
                 "data",
@@ -436,7 +446,8 @@ impl Bytes<'_> {
     }
 }
 
-pub(crate) fn short(need: u64, have: u64) -> Problem {
+/// Returns the error for data of `have` bytes where `need` are declared.
+pub(crate) fn truncated(need: u64, have: u64) -> Problem {
     Problem::new(
         OpenErrorKind::Damaged,
         "data",
@@ -445,6 +456,7 @@ pub(crate) fn short(need: u64, have: u64) -> Problem {
     )
 }
 
+/// Reserves room for `more` items, or fails where there is no memory.
 pub(crate) fn reserve<T>(out: &mut Vec<T>, more: usize) -> Result<(), Problem> {
     out.try_reserve_exact(more).map_err(|_| {
         Problem::new(

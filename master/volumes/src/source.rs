@@ -1,31 +1,31 @@
-//! Bytes of files that strangers made: what may be opened, and how far a reader is followed.
+//! Opens files that are not trusted.
 //!
 //! Three rules (docs/design/promises.md R13 to R15). Only regular files are opened, so no pipe can
-//! hold us up. A header can name data only inside its own folder. Sizes that a header claims are
-//! never believed before as many bytes have been seen.
+//! block the program. A header can name data only inside its own folder. A size in a header takes
+//! no memory before as many bytes were seen.
 
 use crate::error::{OpenErrorKind, Problem};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Seek};
 use std::path::{Path, PathBuf};
 
-/// What a [`Source`] reads from.
+/// Reader under a [`Source`]: a file, or bytes of a test.
 pub(crate) trait Stream: Read + Seek + Send {}
 impl<T: Read + Seek + Send> Stream for T {}
 
-/// An open file, or a test's bytes.
+/// An open file with its length, or the bytes of a test.
 pub(crate) struct Source {
     pub(crate) reader: BufReader<Box<dyn Stream>>,
     /// Bytes of the whole file.
     pub(crate) len: u64,
 }
 
-/// Enough to see what a file is ([`Source::head`]) and to keep system calls few; samples are
-/// read past it in larger pieces.
+/// Enough to recognise a format ([`Source::head`]) with few system calls. Samples are read past the
+/// buffer in larger pieces.
 const BUFFER_BYTES: usize = 64 << 10;
 
 impl Source {
-    /// Opens a regular file; a folder, pipe, socket or device is refused unread.
+    /// Opens a regular file; refuses a folder, pipe, socket or device without reading it.
     pub(crate) fn open(path: &Path, field: &str) -> Result<Source, Problem> {
         let unreadable = |what: String, remedy: &str| {
             Err(Problem::new(OpenErrorKind::Unreadable, field, what, remedy))
@@ -39,8 +39,8 @@ impl Source {
             }
             _ => unreadable(format!("can't be opened ({e})"), "check the path"),
         };
-        // Asked before opening, since opening a pipe waits for its writer; and again after, for
-        // what was put in its place meanwhile.
+        // Checked before opening, since opening a pipe waits for its writer, and again after it, in
+        // case the file was replaced meanwhile.
         let meta = match std::fs::metadata(path) {
             Ok(meta) => meta,
             Err(e) => return refused(e),
@@ -70,9 +70,9 @@ impl Source {
         })
     }
 
-    /// The bytes of a test.
+    /// Returns a source of bytes, for tests.
     #[cfg(test)]
-    pub(crate) fn memory(bytes: Vec<u8>) -> Source {
+    pub(crate) fn from_bytes(bytes: Vec<u8>) -> Source {
         let len = bytes.len() as u64;
         Source {
             reader: BufReader::with_capacity(BUFFER_BYTES, Box::new(std::io::Cursor::new(bytes))),
@@ -80,15 +80,19 @@ impl Source {
         }
     }
 
-    /// The first bytes (up to 64 KiB), not consumed.
+    /// Returns the first bytes (up to 64 KiB) without consuming them.
     pub(crate) fn head(&mut self) -> Result<&[u8], Problem> {
         self.reader.fill_buf().map_err(|e| Problem::io("content", &e))
     }
 }
 
-/// The file that a header in `folder` calls `name`: inside that folder or below it, links
-/// followed, else refused.
-pub(crate) fn beside(folder: &Path, name: &str, field: &str) -> Result<PathBuf, Problem> {
+/// Returns the path of the file that a header in `folder` calls `name`. Follows links, and refuses
+/// a file outside the folder.
+pub(crate) fn resolve_in_folder(
+    folder: &Path,
+    name: &str,
+    field: &str,
+) -> Result<PathBuf, Problem> {
     let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
     let shown = crate::error::quoted(name);
     let missing = |e: std::io::Error| {
@@ -111,7 +115,7 @@ pub(crate) fn beside(folder: &Path, name: &str, field: &str) -> Result<PathBuf, 
     Ok(path)
 }
 
-/// Skips `lines` lines; the number of bytes skipped, or `None` where the data end before.
+/// Skips lines and returns their bytes; `None` if the data end before.
 pub(crate) fn skip_lines(reader: &mut impl BufRead, lines: u64) -> std::io::Result<Option<u64>> {
     let mut skipped = 0;
     let mut left = lines;
@@ -121,9 +125,9 @@ pub(crate) fn skip_lines(reader: &mut impl BufRead, lines: u64) -> std::io::Resu
             return Ok(None);
         }
         let used = match chunk.iter().position(|&b| b == b'\n') {
-            Some(at) => {
+            Some(newline) => {
                 left -= 1;
-                at + 1
+                newline + 1
             }
             None => chunk.len(),
         };
@@ -133,7 +137,7 @@ pub(crate) fn skip_lines(reader: &mut impl BufRead, lines: u64) -> std::io::Resu
     Ok(Some(skipped))
 }
 
-/// Reads and drops `bytes` bytes; false where the data end before.
+/// Reads and drops bytes; false if the data end before.
 pub(crate) fn skip_bytes(reader: &mut dyn Read, bytes: u64) -> std::io::Result<bool> {
     Ok(std::io::copy(&mut reader.take(bytes), &mut std::io::sink())? == bytes)
 }

@@ -45,8 +45,8 @@ enum Content {
 impl BrickStore {
     /// Cuts a volume into bricks on all cores of rayon's pool.
     ///
-    /// `digest` is [`Volume::digest`] of `volume`. Bricks without a relevant voxel are left out, and
-    /// so are normals and gradients that `needs` does not ask for.
+    /// `digest` is [`Volume::digest`] of `volume`. Bricks without a relevant voxel are left out,
+    /// and so are normals and gradients that `needs` does not ask for.
     pub fn build(volume: &Volume, digest: Digest32, needs: &BrickNeeds) -> Self {
         let support = &needs.support;
         let bricks = match &volume.samples {
@@ -84,13 +84,14 @@ impl BrickStore {
         &self.needs
     }
 
-    /// Returns the directory: id, tight box, voxels and encoded bytes of each brick, in ascending id.
+    /// Returns the directory: id, tight box, voxels and encoded bytes of each brick, in ascending
+    /// id.
     pub fn infos(&self) -> &Arc<[BrickInfo]> {
         &self.infos
     }
 
-    /// Returns a decoded brick; `None` if it has no relevant voxel. It is decoded at the first call,
-    /// and shared and kept decoded from then on.
+    /// Returns a decoded brick; `None` if it has no relevant voxel. It is decoded at the first
+    /// call, and shared and kept decoded from then on.
     pub fn brick(&self, id: BrickId) -> Option<Arc<Brick>> {
         let mut content = self.content(id)?;
         let brick = match &*content {
@@ -103,7 +104,8 @@ impl BrickStore {
     }
 
     /// Returns the encoding of a brick ([`Brick::encode`]); `None` if it has no relevant voxel. The
-    /// bytes are shared, unless [`BrickStore::brick`] was called for it: then they are encoded anew.
+    /// bytes are shared, unless [`BrickStore::brick`] was called for it: then they are encoded
+    /// anew.
     pub fn encoded(&self, id: BrickId) -> Option<Bytes> {
         Some(match &*self.content(id)? {
             Content::Encoded(bytes) => bytes.clone(),
@@ -273,7 +275,8 @@ impl<T: Copy + Into<f64>> Codes<'_, T> {
                 let run = &self.codes[start..start + (end[0] - corner[0]) as usize];
                 let row = (y - corner[1]) * 8 + (z - corner[2]) * 64;
                 let before = found.voxels;
-                // Each voxel is stored, and counted only if relevant: no branch depends on the data.
+                // Each voxel is stored, and counted only if relevant: no branch depends on the
+                // data.
                 for (x, &code) in run.iter().enumerate() {
                     found.index[found.voxels] = (row + x as u32) as u16;
                     found.offset[found.voxels] = start + x;

@@ -1,10 +1,10 @@
-//! Stacks of TIFF pictures: the pages of one file, or the files of a folder in the order of the
+//! Reader of TIFF stacks: the pages of one file, or the files of a folder in the order of the
 //! numbers in their names.
 //!
-//! The `tiff` crate reads strips and tiles; we ask for one band of them at a time, so that no
-//! page is ever held whole, and see to it that a band is no larger than the file can account for.
-//! TIFF has no word for the distance of pages. Where ImageJ or OME have written theirs into the
-//! description it is taken; resolutions alone are not, since picture programs fill in 72 dpi.
+//! The `tiff` crate decodes strips and tiles. This reader asks for one band of them at a time, so
+//! that no page is held whole, and checks that a band is no larger than the file can account for.
+//! TIFF has no field for the distance between pages: it comes from the description if ImageJ or OME
+//! wrote one. Resolutions alone are ignored, since picture programs fill in 72 dpi.
 
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::raw::RawHints;
@@ -19,28 +19,28 @@ use tiff::decoder::{ChunkType, Decoder, Limits};
 use tiff::tags::Tag;
 use tiff::{ColorType, TiffError};
 
-/// Bytes of a band (the strip, or the row of tiles, that is unpacked at a time): room for most
-/// whole pages, and below the 64 MiB that reading may take beside the voxels.
+/// Most bytes of a band, the strip or row of tiles decoded at a time: room for most whole pages,
+/// and below the 64 MiB that reading may take beside the voxels.
 const BAND_MAX_BYTES: u64 = 48 << 20;
-/// A band of this size is taken at a file's word; a larger one needs half as many bytes in the
-/// file, so that a small file can't make us take much.
+/// Most bytes of a band in a small file. A larger band needs at least half as many bytes in the
+/// file, so that a small file can't take much memory.
 const BAND_FREE_BYTES: u64 = 8 << 20;
 
-/// Whether these first bytes are TIFF or BigTIFF.
+/// Returns whether the first bytes are TIFF or BigTIFF.
 pub(crate) fn sniff(head: &[u8]) -> bool {
     [&b"II*\0"[..], b"MM\0*", b"II+\0", b"MM\0+"].iter().any(|magic| head.starts_with(magic))
 }
 
-/// Reads the pages of one file.
+/// Reads the pages of one file as slices.
 pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Volume, Problem> {
     let len = source.len;
-    let mut pages = File::open(source)?;
+    let mut pages = TiffFile::open(source)?;
     let first = pages.page()?;
     let mut count = 1;
     while pages.next()? {
         let page = pages.page()?;
         if page != first {
-            return Err(differs(&format!("page {}", count + 1), &page, &first));
+            return Err(page_differs(&format!("page {}", count + 1), &page, &first));
         }
         count += 1;
         if count > DIM_MAX {
@@ -50,17 +50,17 @@ pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Volum
     let spacing = pages.first_spacing(count)?;
     pages.rewind()?;
     let stack = Stack {
-        now: Some(pages),
+        current: Some(pages),
         files: VecDeque::new(),
         page: first,
         band: Vec::new(),
-        at: 0,
+        consumed: 0,
         row: 0,
     };
     finish(stack, count, len, name, hints.spacing.or(spacing))
 }
 
-/// Reads the files of a folder, which are TIFF and in order. `name` is what to call the volume.
+/// Reads TIFF files, in the order given, as slices of a volume called `name`.
 pub(crate) fn read_files(
     files: Vec<PathBuf>,
     name: &str,
@@ -73,23 +73,25 @@ pub(crate) fn read_files(
     }
     for path in &files {
         let shown = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let here = |mut p: Problem| {
+        let name_file = |mut p: Problem| {
             p.field = format!("{} {}", quoted(&shown), p.field);
             p
         };
-        let source = Source::open(path, "file").map_err(here)?;
+        let source = Source::open(path, "file").map_err(name_file)?;
         total += source.len;
-        let mut file = File::open(source).map_err(here)?;
-        let page = file.page().map_err(here)?;
+        let mut file = TiffFile::open(source).map_err(name_file)?;
+        let page = file.page().map_err(name_file)?;
         match &first {
             None => {
                 spacing = file.first_spacing(count)?;
                 first = Some(page);
             }
-            Some(first) if page != *first => return Err(differs(&quoted(&shown), &page, first)),
+            Some(first) if page != *first => {
+                return Err(page_differs(&quoted(&shown), &page, first));
+            }
             Some(_) => {}
         }
-        if file.next().map_err(here)? {
+        if file.next().map_err(name_file)? {
             return Err(Problem::unsupported(
                 quoted(&shown),
                 "has several pages, and is not the only file of its folder",
@@ -97,9 +99,15 @@ pub(crate) fn read_files(
             ));
         }
     }
-    let page = first.expect("whoever calls has seen a file");
-    let stack =
-        Stack { now: None, files: files.into(), page, band: Vec::new(), at: 0, row: page.height };
+    let page = first.expect("the caller passes a file");
+    let stack = Stack {
+        current: None,
+        files: files.into(),
+        page,
+        band: Vec::new(),
+        consumed: 0,
+        row: page.height,
+    };
     finish(stack, count, total, name, hints.spacing.or(spacing))
 }
 
@@ -116,7 +124,7 @@ fn finish(
     let layout = Layout::new(dims, number, endian, "pages")?;
     let lattice = Lattice::from_spacing(layout.dims, spacing.unwrap_or([1.0; 3]));
     lattice.check().map_err(|e| Problem::malformed("spacing", e, "give it with --spacing"))?;
-    // A code of 12 bits stands for at most 4096 bytes in LZW, the densest of what is read.
+    // LZW is the densest encoding read: a code of 12 bits stands for at most 4096 bytes.
     let supply = Supply::Encoded { name: "TIFF", bytes: len, ratio: 4096 };
     let (samples, map) = samples::read(&mut stack, supply, &layout)?;
     Ok(Volume::new(name, number.name(), false, lattice, samples, map))
@@ -131,7 +139,7 @@ fn too_many(count: u64) -> Problem {
     )
 }
 
-fn differs(which: &str, page: &Page, first: &Page) -> Problem {
+fn page_differs(which: &str, page: &Page, first: &Page) -> Problem {
     Problem::malformed(
         which,
         format!("is {page}, where the first is {first}"),
@@ -139,7 +147,7 @@ fn differs(which: &str, page: &Page, first: &Page) -> Problem {
     )
 }
 
-/// What all pages of a stack have in common.
+/// Size and type of a page, the same for all pages of a stack.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Page {
     width: u32,
@@ -153,27 +161,28 @@ impl std::fmt::Display for Page {
     }
 }
 
-/// One TIFF file, at one of its pages.
-struct File {
+/// An open TIFF file, positioned at one of its pages.
+struct TiffFile {
     decoder: Decoder<BufReader<Box<dyn Stream>>>,
-    band_max: u64,
+    band_max_bytes: u64,
 }
 
-impl File {
-    fn open(source: Source) -> Result<File, Problem> {
-        let band_max = BAND_MAX_BYTES.min(BAND_FREE_BYTES.max(2 * source.len));
+impl TiffFile {
+    fn open(source: Source) -> Result<TiffFile, Problem> {
+        let band_max_bytes = BAND_MAX_BYTES.min(BAND_FREE_BYTES.max(2 * source.len));
         let mut limits = Limits::unlimited();
-        limits.decoding_buffer_size = band_max as usize;
-        limits.intermediate_buffer_size = band_max as usize;
+        limits.decoding_buffer_size = band_max_bytes as usize;
+        limits.intermediate_buffer_size = band_max_bytes as usize;
         limits.ifd_value_size = 1 << 20;
-        let decoder = Decoder::new(source.reader).map_err(|e| trouble(&e))?.with_limits(limits);
-        Ok(File { decoder, band_max })
+        let decoder =
+            Decoder::new(source.reader).map_err(|e| tiff_problem(&e))?.with_limits(limits);
+        Ok(TiffFile { decoder, band_max_bytes })
     }
 
-    /// Goes to the next page that is no thumbnail; false where there is none.
+    /// Moves to the next page that is no thumbnail; false if there is none.
     fn next(&mut self) -> Result<bool, Problem> {
         while self.decoder.more_images() {
-            self.decoder.next_image().map_err(|e| trouble(&e))?;
+            self.decoder.next_image().map_err(|e| tiff_problem(&e))?;
             if !self.is_reduced() {
                 return Ok(true);
             }
@@ -181,20 +190,20 @@ impl File {
         Ok(false)
     }
 
-    /// Whether the page is a smaller version of another one.
+    /// Returns whether the page is a smaller version of another one.
     fn is_reduced(&mut self) -> bool {
         let kind = self.decoder.find_tag_unsigned::<u32>(Tag::NewSubfileType);
         kind.ok().flatten().is_some_and(|kind| kind & 1 == 1)
     }
 
     fn rewind(&mut self) -> Result<(), Problem> {
-        self.decoder.seek_to_image(0).map_err(|e| trouble(&e))
+        self.decoder.seek_to_image(0).map_err(|e| tiff_problem(&e))
     }
 
-    /// What the page is, if it can be part of a volume.
+    /// Returns size and type of the page; fails if it can't be a slice of a volume.
     fn page(&mut self) -> Result<Page, Problem> {
-        let (width, height) = self.decoder.dimensions().map_err(|e| trouble(&e))?;
-        let bits = match self.decoder.colortype().map_err(|e| trouble(&e))? {
+        let (width, height) = self.decoder.dimensions().map_err(|e| tiff_problem(&e))?;
+        let bits = match self.decoder.colortype().map_err(|e| tiff_problem(&e))? {
             ColorType::Gray(bits) => bits,
             other => {
                 return Err(Problem::unsupported(
@@ -225,26 +234,30 @@ impl File {
                 ));
             }
         };
-        // Looked at here, since the first look should refuse what the second could not read.
+        // Checked here, so that the first pass refuses what the second could not read.
         Layout::new([width.into(), height.into(), 1], number, Endian::Little, "ImageWidth")?;
         let (chunk_width, chunk_height) = self.decoder.chunk_dimensions();
         let tiled = self.decoder.get_chunk_type() == ChunkType::Tile;
         let rows = u64::from(chunk_height.min(height));
-        // A tile is unpacked beside its band.
+        // A tile is decoded beside its band.
         let tile = if tiled { u64::from(chunk_width) * u64::from(chunk_height) } else { 0 };
         let band = (rows * u64::from(width) + tile).saturating_mul(number.bytes());
-        if chunk_width == 0 || chunk_height == 0 || band > self.band_max {
+        if chunk_width == 0 || chunk_height == 0 || band > self.band_max_bytes {
             return Err(Problem::new(
                 OpenErrorKind::TooLarge,
                 if tiled { "TileLength" } else { "RowsPerStrip" },
-                format!("bands of {band} bytes are more than the {} that are read", self.band_max),
+                format!(
+                    "bands of {band} bytes are more than the {} that are read",
+                    self.band_max_bytes
+                ),
                 "save it with smaller strips or tiles",
             ));
         }
         Ok(Page { width, height, number })
     }
 
-    /// The next band of a page from `row` on: its bytes in the machine's order, rows in order.
+    /// Decodes the band of a page that starts at `row`, in the machine's byte order, and returns
+    /// its rows.
     fn band(&mut self, page: &Page, row: u32, band: &mut Vec<u8>) -> Result<u32, Problem> {
         let (chunk_width, chunk_height) = self.decoder.chunk_dimensions();
         let rows = chunk_height.min(page.height - row);
@@ -260,50 +273,50 @@ impl File {
         let first = row / chunk_height * across;
         if across == 1 && chunk_width >= page.width {
             let index = first;
-            self.has(index)?;
+            self.check_chunk(index)?;
             let (w, h) = self.decoder.chunk_data_dimensions(index);
             if (w, h) == (page.width, rows) {
-                self.decoder.read_chunk_bytes(index, band).map_err(|e| trouble(&e))?;
+                self.decoder.read_chunk_bytes(index, band).map_err(|e| tiff_problem(&e))?;
                 return Ok(rows);
             }
         }
         let mut tile = Vec::new();
         for x in 0..across {
             let index = first + x;
-            self.has(index)?;
+            self.check_chunk(index)?;
             let (w, h) = self.decoder.chunk_data_dimensions(index);
             let (w, h) = (w as usize, h as usize);
-            let from = (x * chunk_width) as usize * size;
-            if h < rows as usize || from + w * size > stride {
+            let left = (x * chunk_width) as usize * size;
+            if h < rows as usize || left + w * size > stride {
                 return Err(Problem::malformed("TileLength", "does not fit the page", RESAVE));
             }
             tile.clear();
             samples::reserve(&mut tile, w * h * size)?;
             tile.resize(w * h * size, 0);
-            self.decoder.read_chunk_bytes(index, &mut tile).map_err(|e| trouble(&e))?;
-            for (to, from_tile) in band.chunks_exact_mut(stride).zip(tile.chunks_exact(w * size)) {
-                to[from..from + w * size].copy_from_slice(from_tile);
+            self.decoder.read_chunk_bytes(index, &mut tile).map_err(|e| tiff_problem(&e))?;
+            for (row, tile_row) in band.chunks_exact_mut(stride).zip(tile.chunks_exact(w * size)) {
+                row[left..left + w * size].copy_from_slice(tile_row);
             }
         }
         Ok(rows)
     }
 
-    /// Refuses a chunk that the file does not list; the library panics.
-    fn has(&mut self, index: u32) -> Result<(), Problem> {
+    /// Refuses a chunk that the file does not list; the `tiff` crate would panic.
+    fn check_chunk(&mut self, index: u32) -> Result<(), Problem> {
         let count = match self.decoder.get_chunk_type() {
             ChunkType::Strip => self.decoder.strip_count(),
             ChunkType::Tile => self.decoder.tile_count(),
         };
-        if index < count.map_err(|e| trouble(&e))? {
+        if index < count.map_err(|e| tiff_problem(&e))? {
             return Ok(());
         }
         Err(Problem::malformed("StripOffsets", "has fewer entries than the page needs", RESAVE))
     }
 
-    /// What the page's description says of the distances of samples, in mm; refuses channels and
-    /// pages that are not there.
+    /// Returns the sample distances, in mm, of the first page's description. Refuses a description
+    /// with several channels or more pages than there are.
     fn first_spacing(&mut self, pages: u64) -> Result<Option<[f64; 3]>, Problem> {
-        // It stands on the first page.
+        // The description is on the first page.
         self.rewind()?;
         let Ok(text) = self.decoder.get_tag_ascii_string(Tag::ImageDescription) else {
             return Ok(None);
@@ -314,80 +327,85 @@ impl File {
             }
             _ => None,
         };
-        let said = Description::of(&text);
-        if said.channels > 1 || said.images > pages {
+        let description = Description::parse(&text);
+        if description.channels > 1 || description.images > pages {
             return Err(Problem::unsupported(
                 "ImageDescription",
                 format!(
                     "says {} channels or times of {} pictures, and {pages} pages are there",
-                    said.channels, said.images
+                    description.channels, description.images
                 ),
                 "save one channel and one time, a page for each slice",
             ));
         }
-        let flat = match said.flat {
-            Some(flat) => Some(flat),
-            // OME has no unit of pixels; ImageJ's counts for them.
+        let pixel_spacing = match description.pixel_spacing {
+            Some(spacing) => Some(spacing),
+            // OME gives no unit for the resolution; ImageJ's unit applies to it.
             None if text.contains("<OME") => None,
             None => resolution(&mut self.decoder, Tag::XResolution)
                 .zip(resolution(&mut self.decoder, Tag::YResolution)),
         };
-        let spacing =
-            said.mm.zip(flat).map(|(mm, (x, y))| [x * mm, y * mm, said.depth.unwrap_or(1.0) * mm]);
+        let spacing = description
+            .mm
+            .zip(pixel_spacing)
+            .map(|(mm, (x, y))| [x * mm, y * mm, description.page_spacing.unwrap_or(1.0) * mm]);
         Ok(spacing.filter(|s| s.iter().all(|x| x.is_finite() && *x > 0.0)))
     }
 }
 
 const RESAVE: &str = "save it again, for instance with ImageJ";
 
-/// What ImageJ and OME write into the description of the first page.
+/// The description that ImageJ or OME wrote into the first page.
 #[derive(Debug, Default, PartialEq)]
 struct Description {
-    /// Millimetres of its unit, where it names one.
+    /// Millimetres of its unit, if it names one.
     mm: Option<f64>,
-    /// Distance of pixels, where it says it itself.
-    flat: Option<(f64, f64)>,
-    depth: Option<f64>,
-    /// Channels times points of time.
+    /// Distances of pixels along x and y, if it gives them, in its unit.
+    pixel_spacing: Option<(f64, f64)>,
+    /// Distance of pages, in its unit.
+    page_spacing: Option<f64>,
+    /// Channels times points in time.
     channels: u64,
+    /// Number of slices.
     images: u64,
 }
 
 impl Description {
-    fn of(text: &str) -> Description {
-        let mut said = Description { channels: 1, ..Description::default() };
+    fn parse(text: &str) -> Description {
+        let mut description = Description { channels: 1, ..Description::default() };
         if text.starts_with("ImageJ=") {
             let get = |key: &str| {
                 text.lines().find_map(|l| l.strip_prefix(key)?.strip_prefix('=').map(str::trim))
             };
             let number = |key| get(key).and_then(|v| v.parse::<u64>().ok());
-            said.images = number("images").unwrap_or(0);
+            description.images = number("images").unwrap_or(0);
             let product =
                 number("channels").unwrap_or(1).checked_mul(number("frames").unwrap_or(1));
-            said.channels = product.unwrap_or(u64::MAX);
-            said.mm = get("unit").and_then(millimetres);
-            said.depth = get("spacing").and_then(|v| v.parse().ok());
+            description.channels = product.unwrap_or(u64::MAX);
+            description.mm = get("unit").and_then(millimetres);
+            description.page_spacing = get("spacing").and_then(|v| v.parse().ok());
         } else if text.contains("<OME") {
             let get = |key: &str| {
                 let after = text.split_once(&format!(" {key}=\""))?.1;
                 after.split_once('"').map(|(value, _)| value)
             };
             let number = |key| get(key).and_then(|v| v.parse::<u64>().ok()).unwrap_or(1);
-            said.channels = number("SizeC").saturating_mul(number("SizeT"));
-            said.images = number("SizeZ");
+            description.channels = number("SizeC").saturating_mul(number("SizeT"));
+            description.images = number("SizeZ");
             let size = |key: &str| {
                 let mm = millimetres(get(&format!("{key}Unit")).unwrap_or("um"))?;
                 Some(get(key)?.parse::<f64>().ok()? * mm)
             };
-            // In mm already, each by its own unit.
-            said.flat = size("PhysicalSizeX").zip(size("PhysicalSizeY"));
-            said.depth = size("PhysicalSizeZ");
-            said.mm = Some(1.0);
+            // Converted to mm, each from its own unit.
+            description.pixel_spacing = size("PhysicalSizeX").zip(size("PhysicalSizeY"));
+            description.page_spacing = size("PhysicalSizeZ");
+            description.mm = Some(1.0);
         }
-        said
+        description
     }
 }
 
+/// Returns the millimetres of a unit of length; `None` if it is unknown.
 fn millimetres(unit: &str) -> Option<f64> {
     Some(match unit {
         "m" => 1000.0,
@@ -399,7 +417,8 @@ fn millimetres(unit: &str) -> Option<f64> {
     })
 }
 
-fn trouble(e: &TiffError) -> Problem {
+/// Converts an error of the `tiff` crate.
+fn tiff_problem(e: &TiffError) -> Problem {
     let short = |text: String| {
         let text: String = text.chars().take(120).collect();
         text
@@ -431,59 +450,59 @@ fn trouble(e: &TiffError) -> Problem {
     }
 }
 
-/// The samples of all pages, one after another.
+/// Reads the samples of all pages, one after another.
 struct Stack {
-    now: Option<File>,
-    /// Files of which none was opened yet.
+    current: Option<TiffFile>,
+    /// Files not yet opened.
     files: VecDeque<PathBuf>,
     page: Page,
     band: Vec<u8>,
-    /// What of the band was handed out.
-    at: usize,
-    /// The first row of the page that was not unpacked.
+    /// Bytes of the band already handed out.
+    consumed: usize,
+    /// First row of the page not yet decoded.
     row: u32,
 }
 
 impl Stack {
-    /// Unpacks the next band; false at the end.
+    /// Decodes the next band; false at the end.
     fn fill(&mut self) -> Result<bool, Problem> {
         if self.row >= self.page.height {
-            let more = match &mut self.now {
+            let more = match &mut self.current {
                 Some(file) if self.files.is_empty() => file.next()?,
                 _ => false,
             };
             if !more {
                 let Some(path) = self.files.pop_front() else { return Ok(false) };
-                self.now = Some(File::open(Source::open(&path, "file")?)?);
+                self.current = Some(TiffFile::open(Source::open(&path, "file")?)?);
             }
             self.row = 0;
         }
-        let Some(file) = &mut self.now else { return Ok(false) };
-        // The file may have changed since it was looked at.
+        let Some(file) = &mut self.current else { return Ok(false) };
+        // The file may have changed since the first pass.
         let page = file.page()?;
         if page != self.page {
-            return Err(differs("a page", &page, &self.page));
+            return Err(page_differs("a page", &page, &self.page));
         }
         self.row += file.band(&page, self.row, &mut self.band)?;
-        self.at = 0;
+        self.consumed = 0;
         Ok(true)
     }
 }
 
 impl Read for Stack {
     fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
-        if self.at == self.band.len() && !self.fill().map_err(wrapped)? {
+        if self.consumed == self.band.len() && !self.fill().map_err(wrapped)? {
             return Ok(0);
         }
-        let n = (self.band.len() - self.at).min(buf.len());
-        buf[..n].copy_from_slice(&self.band[self.at..self.at + n]);
-        self.at += n;
+        let n = (self.band.len() - self.consumed).min(buf.len());
+        buf[..n].copy_from_slice(&self.band[self.consumed..self.consumed + n]);
+        self.consumed += n;
         Ok(n)
     }
 }
 
-/// Names in the order that people mean: numbers in them by their size.
-pub(crate) fn by_number(a: &Path, b: &Path) -> std::cmp::Ordering {
+/// Compares file names in natural order: numbers in them by value, letters without case.
+pub(crate) fn compare_by_number(a: &Path, b: &Path) -> std::cmp::Ordering {
     let key = |p: &Path| {
         let name = p.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
         let mut words: Vec<(String, String)> = Vec::new();
@@ -493,7 +512,7 @@ pub(crate) fn by_number(a: &Path, b: &Path) -> std::cmp::Ordering {
             let end = rest.find(|c: char| c.is_ascii_digit() != digits).unwrap_or(rest.len());
             let word = &rest[..end];
             rest = &rest[end..];
-            // Numbers compare by length, then digits; leading zeros don't count.
+            // Numbers compare by length, then by digits, without leading zeros.
             let bare = if digits { word.trim_start_matches('0') } else { word };
             let rank = if digits { format!("0{:04}", bare.len()) } else { "1".into() };
             words.push((rank, bare.to_string()));

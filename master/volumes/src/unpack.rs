@@ -1,5 +1,5 @@
-//! Encodings between a file's bytes and its samples: packed, or written as text. Each is a reader
-//! over a reader, so that nothing is ever held whole, and each says how much it can become at most
+//! Decoders between a file's bytes and its samples: compression, and numbers written as text. Each
+//! is a reader over a reader, so that no file is held whole, and each bounds its output
 //! ([`Supply`]).
 
 use crate::error::{OpenErrorKind, Problem, quoted};
@@ -14,17 +14,17 @@ pub(crate) enum Encoding {
     Raw,
     Gzip,
     Bzip2,
-    /// Decimal numbers, whitespace between them.
+    /// Decimal numbers separated by whitespace or commas.
     Ascii,
-    /// Two digits a byte.
+    /// Two hexadecimal digits for each byte.
     Hex,
-    /// A zlib stream or a gzip one: MetaImage writers make either.
+    /// zlib or gzip; MetaImage writers produce either.
     Deflate,
 }
 
 impl Encoding {
-    /// A reader of bytes out of `inner`, which has `bytes` bytes left. Text becomes numbers in
-    /// little-endian order whatever the header says ([`Encoding::has_order`]).
+    /// Returns a reader that decodes `inner`, which has `bytes` bytes left. Numbers in text come
+    /// out little-endian whatever the header says ([`Encoding::has_order`]).
     pub(crate) fn open<'a>(
         self,
         mut inner: Box<dyn BufRead + Send + 'a>,
@@ -43,24 +43,24 @@ impl Encoding {
             Encoding::Deflate => {
                 (Box::new(ZlibDecoder::new(inner)), Supply::deflate("zlib", bytes))
             }
-            // A block of 900,000 bytes holds runs of 259 as five bytes, and may then pack to 40.
+            // Runs of 259 bytes become five, and a block of 900,000 of those compresses to 40.
             Encoding::Bzip2 => (Box::new(MultiBzDecoder::new(inner)), encoded("bzip2", 1 << 21)),
-            // A digit and a space, at least; the last space may be missing, hence not a half.
+            // A number takes at least a digit and a space; the last space may be missing.
             Encoding::Ascii => (
-                Box::new(Text { inner, number, word: Vec::new(), out: [0; 8], at: 8, seen: 0 }),
+                Box::new(Text { inner, number, word: Vec::new(), out: [0; 8], next: 8, seen: 0 }),
                 encoded("text", number.bytes()),
             ),
             Encoding::Hex => (Box::new(Hex { inner }), encoded("hexadecimal digits", 1)),
         })
     }
 
-    /// Whether the file's byte order counts.
+    /// Returns whether the byte order of the header applies.
     pub(crate) fn has_order(self) -> bool {
         self != Encoding::Ascii
     }
 }
 
-/// A problem that travels through [`Read`].
+/// Wraps a problem in an I/O error, so that it passes through [`Read`].
 pub(crate) fn wrapped(problem: Problem) -> std::io::Error {
     std::io::Error::new(std::io::ErrorKind::InvalidData, problem)
 }
@@ -69,23 +69,25 @@ fn damaged(what: String, remedy: &str) -> std::io::Error {
     wrapped(Problem::new(OpenErrorKind::Damaged, "data", what, remedy))
 }
 
-/// Decimal numbers as bytes.
+/// Decodes decimal numbers to little-endian bytes.
 struct Text<'a> {
     inner: Box<dyn BufRead + Send + 'a>,
     number: Number,
     word: Vec<u8>,
-    /// The number that is handed out, at the end of the eight bytes.
+    /// The current number, at the end of the eight bytes.
     out: [u8; 8],
-    at: usize,
-    /// Numbers before it, for messages.
+    /// Index in `out` of the next byte to hand out.
+    next: usize,
+    /// Numbers decoded so far, for error messages.
     seen: u64,
 }
 
-/// Longest number: `-1.7976931348623157e+308` has 24 characters; some programs print 40 digits.
-const WORD_MAX: usize = 64;
+/// Longest number in characters: `-1.7976931348623157e+308` has 24, and some programs print 40
+/// digits.
+const WORD_MAX_BYTES: usize = 64;
 
 impl Text<'_> {
-    /// The next word, or none at the end.
+    /// Reads the next word; false at the end.
     fn next_word(&mut self) -> std::io::Result<bool> {
         self.word.clear();
         loop {
@@ -97,10 +99,10 @@ impl Text<'_> {
             let mut whole = false;
             for &b in chunk {
                 used += 1;
-                // teem and ITK also put commas between numbers.
+                // teem and ITK also accept commas.
                 if !b.is_ascii_whitespace() && b != b',' {
                     self.word.push(b);
-                    if self.word.len() > WORD_MAX {
+                    if self.word.len() > WORD_MAX_BYTES {
                         whole = true;
                         break;
                     }
@@ -116,7 +118,8 @@ impl Text<'_> {
         }
     }
 
-    fn number(&mut self) -> std::io::Result<()> {
+    /// Decodes the word to the bytes of a number.
+    fn decode_word(&mut self) -> std::io::Result<()> {
         let size = self.number.bytes() as usize;
         let text = std::str::from_utf8(&self.word).unwrap_or("?");
         macro_rules! le {
@@ -139,7 +142,7 @@ impl Text<'_> {
             Number::F32 => le!(f32),
             Number::F64 => le!(f64),
         };
-        self.at = 8 - size;
+        self.next = 8 - size;
         self.seen += 1;
         read.ok_or_else(|| {
             damaged(
@@ -159,22 +162,22 @@ impl Read for Text<'_> {
     fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
         let mut done = 0;
         while done < buf.len() {
-            if self.at == 8 {
+            if self.next == 8 {
                 if !self.next_word()? {
                     break;
                 }
-                self.number()?;
+                self.decode_word()?;
             }
-            let n = (8 - self.at).min(buf.len() - done);
-            buf[done..done + n].copy_from_slice(&self.out[self.at..self.at + n]);
-            self.at += n;
+            let n = (8 - self.next).min(buf.len() - done);
+            buf[done..done + n].copy_from_slice(&self.out[self.next..self.next + n]);
+            self.next += n;
             done += n;
         }
         Ok(done)
     }
 }
 
-/// Pairs of hexadecimal digits as bytes.
+/// Decodes pairs of hexadecimal digits to bytes.
 struct Hex<'a> {
     inner: Box<dyn BufRead + Send + 'a>,
 }
@@ -227,22 +230,26 @@ impl Read for Hex<'_> {
     }
 }
 
-/// Groups of four base64 characters as bytes, up to the first that has padding. Whitespace
-/// between characters is skipped; any other character ends it, unread.
+/// Decodes base64 up to the first group with padding. Skips whitespace; any other character ends
+/// the data and is not consumed.
 pub(crate) struct Base64<R> {
     pub(crate) inner: R,
+    /// The current group, decoded to at most three bytes.
     group: [u8; 3],
-    at: usize,
+    /// Index in `group` of the next byte to hand out.
+    next: usize,
+    /// Bytes in `group`.
     have: usize,
+    /// Whether a group had padding.
     ended: bool,
 }
 
 impl<R: BufRead> Base64<R> {
     pub(crate) fn new(inner: R) -> Self {
-        Base64 { inner, group: [0; 3], at: 0, have: 0, ended: false }
+        Base64 { inner, group: [0; 3], next: 0, have: 0, ended: false }
     }
 
-    /// Reads the next group; none at the end.
+    /// Reads the next group; false at the end.
     fn next_group(&mut self) -> std::io::Result<bool> {
         let (mut bits, mut digits, mut padding) = (0u32, 0, 0);
         while digits + padding < 4 {
@@ -304,14 +311,14 @@ impl<R: BufRead> Base64<R> {
         }
         bits <<= 6 * padding;
         self.group = [(bits >> 16) as u8, (bits >> 8) as u8, bits as u8];
-        (self.at, self.have) = (0, 3 - padding);
+        (self.next, self.have) = (0, 3 - padding);
         self.ended = padding > 0;
         Ok(true)
     }
 
-    /// Makes ready for what follows another padding: VTK encodes a header and its data apart.
+    /// Continues after padding: VTK encodes a header and its data separately.
     pub(crate) fn restart(&mut self) {
-        (self.at, self.have, self.ended) = (0, 0, false);
+        (self.next, self.have, self.ended) = (0, 0, false);
     }
 }
 
@@ -319,12 +326,12 @@ impl<R: BufRead> Read for Base64<R> {
     fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
         let mut done = 0;
         while done < buf.len() {
-            if self.at == self.have && (self.ended || !self.next_group()?) {
+            if self.next == self.have && (self.ended || !self.next_group()?) {
                 break;
             }
-            let n = (self.have - self.at).min(buf.len() - done);
-            buf[done..done + n].copy_from_slice(&self.group[self.at..self.at + n]);
-            self.at += n;
+            let n = (self.have - self.next).min(buf.len() - done);
+            buf[done..done + n].copy_from_slice(&self.group[self.next..self.next + n]);
+            self.next += n;
             done += n;
         }
         Ok(done)

@@ -1,5 +1,5 @@
-//! What a header may not do: point outside its folder, hold us up on a pipe, or make us take
-//! memory and time for sizes that it only claims (docs/design/promises.md R13, R14, R15).
+//! Tests that a hostile header can't point outside its folder, block on a pipe, or cost memory and
+//! time for sizes without data (docs/design/promises.md R13, R14, R15).
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 const HEADER: &str = "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 4 3 2\nencoding: raw\n";
 
-/// The kind and the line of the refusal, which must come at once.
+/// Returns kind and text of the error, which must come within 2 s.
 fn refusal(path: &Path) -> (OpenErrorKind, String) {
     let start = Instant::now();
     let e = open(path).expect_err("it must be refused");
@@ -21,7 +21,7 @@ fn refusal(path: &Path) -> (OpenErrorKind, String) {
 }
 
 #[test]
-fn no_volume_no_panic() {
+fn files_that_are_no_volume_are_refused_with_kind_and_reason() {
     let dir = tempfile::tempdir().unwrap();
     let file = |name: &str, bytes: &[u8]| {
         let path = dir.path().join(name);
@@ -52,7 +52,7 @@ fn no_volume_no_panic() {
 }
 
 #[test]
-fn content_counts_and_not_the_name() {
+fn content_decides_the_format_not_the_file_name() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("head.nii.gz");
     std::fs::write(&path, [HEADER.as_bytes(), b"\n", &[7; 24]].concat()).unwrap();
@@ -60,7 +60,7 @@ fn content_counts_and_not_the_name() {
 }
 
 #[test]
-fn detached_data_stay_in_the_headers_folder() {
+fn detached_data_outside_the_header_folder_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let inside = dir.path().join("study");
     std::fs::create_dir_all(inside.join("below")).unwrap();
@@ -88,7 +88,7 @@ fn detached_data_stay_in_the_headers_folder() {
 
 #[cfg(unix)]
 #[test]
-fn links_out_pipes_and_devices_are_refused_unread() {
+fn symlinks_out_pipes_and_devices_are_refused_unread() {
     use std::os::unix::fs::symlink;
     let dir = tempfile::tempdir().unwrap();
     let inside = dir.path().join("study");
@@ -121,7 +121,7 @@ fn links_out_pipes_and_devices_are_refused_unread() {
     assert!(line.contains("is a pipe, socket or device, and was not read"), "{line}");
 }
 
-/// Peak resident memory in MiB; `None` where the system does not say.
+/// Returns the peak of resident memory in MiB; `None` where the system has no figure.
 fn peak_mib() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|l| l.starts_with("VmHWM:"))?;
@@ -129,7 +129,7 @@ fn peak_mib() -> Option<u64> {
 }
 
 #[test]
-fn small_files_with_large_claims_take_neither_memory_nor_time() {
+fn small_files_with_large_sizes_take_neither_memory_nor_time() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("liar.nrrd");
     // 128 MiB of zeros in 128 KiB.
@@ -168,7 +168,7 @@ fn small_files_with_large_claims_take_neither_memory_nor_time() {
         let (_, line) = refusal(&path);
         assert!(line.contains(say), "want {say:?} in {line}");
     }
-    // The same bytes as a skip inside gzip: dropped as they come, and not for ever.
+    // As a skip inside gzip the bytes are dropped as they arrive, up to a limit.
     let skip = format!("{}byte skip: 16000000\n\n", HEADER.replace("raw", "gzip"));
     std::fs::write(&path, [skip.as_bytes(), &bomb].concat()).unwrap();
     assert!(refusal(&path).1.contains("goes on after the 24 bytes"));
@@ -176,7 +176,7 @@ fn small_files_with_large_claims_take_neither_memory_nor_time() {
     std::fs::write(&path, [skip.as_bytes(), &bomb].concat()).unwrap();
     assert!(refusal(&path).1.contains("is more than the 16777216 that are skipped"));
     if let (Some(before), Some(after)) = (before, peak_mib()) {
-        // Twice the 4 MiB that came, 16 MiB besides, and as much for other tests beside this.
+        // Twice the 4 MiB read, 16 MiB besides, and as much for tests that run beside this one.
         assert!(after - before < 48, "took {} MiB", after - before);
         println!("{} MiB more at the peak", after - before);
     }

@@ -1,5 +1,5 @@
-//! Files as people have them. They are not part of the repository (their licences differ), but
-//! for the sample; where they are missing the tests say so and pass.
+//! Tests with real files. All but the sample are outside the repository, since their licences
+//! differ; where they are missing, a test prints `skipped: needs shared/data` and passes.
 
 use glam::DVec3;
 use slabcast_common::quality::Compositing;
@@ -11,6 +11,7 @@ use slabcast_volumes::{BrickStore, OpenErrorKind, open};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+/// Returns the path of a file of the data folder; `None`, with a line on stderr, if it is missing.
 fn data(file: &str) -> Option<PathBuf> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
     if !folder.is_dir() {
@@ -25,9 +26,9 @@ fn volume(path: &Path) -> Volume {
     open(path).unwrap_or_else(|e| panic!("{e}"))
 }
 
-/// Size, type and spacing as the README beside the data has them.
+/// Compares with size, type and spacing in the README beside the data.
 #[test]
-fn every_documented_nrrd_opens_with_its_size_type_and_spacing() {
+fn real_nrrd_files_open_with_documented_size_type_and_spacing() {
     for (file, dims, kind, spacing) in [
         ("mri256", [256, 256, 256], "uint8", [1.0; 3]),
         ("aneurism", [256, 256, 256], "uint8", [1.0; 3]),
@@ -57,7 +58,7 @@ fn every_documented_nrrd_opens_with_its_size_type_and_spacing() {
 }
 
 #[test]
-fn shares_above_the_documented_cuts_are_as_documented() {
+fn real_nrrd_files_have_documented_shares_above_thresholds() {
     for (file, cuts) in [
         ("mri256", &[(15.0, 24.1), (40.0, 21.3), (95.0, 7.7)][..]),
         ("aneurism", &[(20.0, 0.73), (100.0, 0.42)]),
@@ -77,7 +78,7 @@ fn shares_above_the_documented_cuts_are_as_documented() {
 }
 
 #[test]
-fn twins_in_other_formats_are_equal() {
+fn real_files_in_several_formats_are_equal() {
     let Some(path) = data("engine.nrrd") else { return };
     let twin = |file: &str| volume(&data(file).expect("the folder is there"));
     let engine = volume(&path);
@@ -99,7 +100,7 @@ fn twins_in_other_formats_are_equal() {
 }
 
 #[test]
-fn metaimage_flips_become_ras() {
+fn real_metaimage_directions_become_ras() {
     let Some(path) = data("formats/metaimage/LIDC2.mha") else { return };
     let v = volume(&path);
     assert!(v.anatomical);
@@ -112,7 +113,7 @@ fn metaimage_flips_become_ras() {
 }
 
 #[test]
-fn slicers_negative_directions_in_lps_point_along_ras() {
+fn real_nrrd_of_slicer_in_lps_becomes_ras() {
     let Some(path) = data("formats/nrrd/A_J_attached_gzip.nrrd") else { return };
     let v = volume(&path);
     let plain = volume(&data("mouse_skull.nrrd").expect("the folder is there"));
@@ -127,7 +128,7 @@ fn slicers_negative_directions_in_lps_point_along_ras() {
 }
 
 #[test]
-fn nifti_files_open_in_the_right_place_with_their_slope() {
+fn real_nifti_files_have_origin_and_slope() {
     let Some(path) = data("formats/nifti/CT_AVM.nii.gz") else { return };
     let avm = volume(&path);
     assert!(avm.anatomical);
@@ -139,7 +140,7 @@ fn nifti_files_open_in_the_right_place_with_their_slope() {
 }
 
 #[test]
-fn the_sample_is_upright_and_not_mirrored() {
+fn sample_volume_is_upright_and_not_mirrored() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../samples/mni152_t1.nii.gz");
     let v = volume(&path);
     assert_eq!((v.name.as_str(), v.file_type.as_str()), ("mni152_t1.nii.gz", "uint8"));
@@ -160,9 +161,9 @@ fn the_sample_is_upright_and_not_mirrored() {
     assert!(inside(25.0, -95.0, 0.0) && !inside(25.0, 95.0, 0.0), "back to front");
 }
 
-/// The normals of a real head against the plain loop, and the time it takes, printed.
+/// Compares the normals of a real head with a plain loop, and prints the time of building.
 #[test]
-fn a_head_is_cut_as_the_plain_loop_says() {
+fn real_head_bricks_match_a_plain_loop() {
     let Some(path) = data("mri256.nrrd") else { return };
     let start = std::time::Instant::now();
     let v = volume(&path);
@@ -178,8 +179,8 @@ fn a_head_is_cut_as_the_plain_loop_says() {
         let corner = grid.corner(info.id);
         for (n, &i) in brick.index.iter().enumerate() {
             let l = slabcast_common::brick::local_position(i);
-            let at = std::array::from_fn(|a| corner[a] + l[a]);
-            assert_eq!(brick.normals.as_ref().unwrap()[n], encode_normal(v.gradient(at, &m)));
+            let voxel = std::array::from_fn(|a| corner[a] + l[a]);
+            assert_eq!(brick.normals.as_ref().unwrap()[n], encode_normal(v.gradient(voxel, &m)));
         }
     }
     let relevant: u64 = v.summary.histogram[39..].iter().sum();
@@ -187,7 +188,7 @@ fn a_head_is_cut_as_the_plain_loop_says() {
 }
 
 #[test]
-fn what_is_no_volume_is_named() {
+fn real_files_that_are_no_volume_are_refused_by_name() {
     for (file, kind, say) in [
         ("README.md", OpenErrorKind::NotAVolume, "is text"),
         ("formats", OpenErrorKind::NotAVolume, "holds no slices or pictures"),

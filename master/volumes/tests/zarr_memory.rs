@@ -1,7 +1,7 @@
-//! A Zarr array is decoded chunk by chunk into its place: what reading takes beside the voxels is a
-//! few chunks, and an array is never in memory twice.
+//! Tests that reading a Zarr array takes only a few chunks of memory beside the voxels, since
+//! chunks are decoded straight to their place.
 //!
-//! A program of its own, since the measure is the peak of a whole process.
+//! A test program of its own, since it measures the peak memory of the process.
 #![cfg(all(feature = "zarr", target_os = "linux"))]
 
 use flate2::Compression;
@@ -11,7 +11,7 @@ use slabcast_volumes::open;
 use std::io::Write;
 use std::path::Path;
 
-/// What reading may take beside the samples as the file has them.
+/// Most memory beside the samples in the file's type.
 const BESIDE_MIB: u64 = 64;
 
 fn put(folder: &Path, name: &str, bytes: &[u8]) {
@@ -69,7 +69,7 @@ fn sharded(folder: &Path) {
     put(folder, "c/0/0/0", &file);
 }
 
-/// A figure of this process in MiB.
+/// Returns a memory figure of this process in MiB.
 fn memory_mib(figure: &str) -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").expect("a status");
     let line = status.lines().find(|l| l.starts_with(figure)).expect("the figure is there");
@@ -77,9 +77,9 @@ fn memory_mib(figure: &str) -> u64 {
     kib.expect("a number") / 1024
 }
 
-/// Opens an array; also says by how many MiB the process grew meanwhile, at its peak.
+/// Opens an array and returns with it by how many MiB the process grew at its peak.
 fn opened(folder: &Path) -> (Volume, u64) {
-    // Begins the peak anew (proc(5)).
+    // Resets the peak (proc(5)).
     std::fs::write("/proc/self/clear_refs", "5").expect("the peak can be begun anew");
     let before = memory_mib("VmRSS:");
     let volume = open(folder).expect("an array");
@@ -87,7 +87,7 @@ fn opened(folder: &Path) -> (Volume, u64) {
 }
 
 #[test]
-fn an_array_is_never_in_memory_twice() {
+fn zarr_array_is_never_in_memory_twice() {
     let dir = tempfile::tempdir().expect("a folder");
     let (plain, shard) = (dir.path().join("chunked"), dir.path().join("sharded"));
     chunked(&plain);
@@ -116,7 +116,7 @@ fn an_array_is_never_in_memory_twice() {
     assert!(codes.iter().enumerate().all(|(i, &c)| c as usize == number_in_chunk(in_chunk(i))));
 }
 
-/// What stands at a place of a chunk.
+/// Returns the sample at a position of a chunk.
 fn number_in_chunk([x, y, z]: [usize; 3]) -> usize {
     (z * 64 + y) * 64 + x
 }

@@ -1,10 +1,9 @@
-//! The data elements of a DICOM file: a walk over tags that keeps a few short values and passes
-//! by everything else.
+//! Parser of the data elements of a DICOM file. It keeps a few short values, skips all others, and
+//! stops at the pixels.
 //!
-//! Why not the `dicom-object` crate: it holds whole files as trees, and took 4.08 GiB and 10 s for
-//! a file of 323 bytes; and by way of its text encodings it brings a crate with an advisory
-//! (`encoding`, unmaintained), which our rules do not let in. A volume needs twenty elements, all
-//! short and in ASCII, and where the pixels begin.
+//! The `dicom-object` crate is not used: it holds whole files as trees, took 4.08 GiB and 10 s for
+//! a file of 323 bytes, and depends on a crate with an advisory (`encoding`, unmaintained). A
+//! volume needs twenty elements, all short and in ASCII, and the position of the pixels.
 
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::samples::Endian;
@@ -13,10 +12,10 @@ use flate2::bufread::DeflateDecoder;
 use std::collections::BTreeMap;
 use std::io::{BufRead, Read};
 
-/// Group and element.
+/// Group and element number.
 pub(super) type Tag = (u16, u16);
 
-/// The elements that are kept, and what to call them.
+/// Elements whose values are kept, with their names.
 pub(super) const KEPT: [(Tag, &str); 24] = [
     ((0x0002, 0x0010), "TransferSyntaxUID"),
     ((0x0008, 0x0060), "Modality"),
@@ -44,52 +43,55 @@ pub(super) const KEPT: [(Tag, &str); 24] = [
     ((0x7fe0, 0x0010), "PixelData"),
 ];
 
-/// Longest value that is kept; six numbers of 16 characters are 101.
+/// Longest value that is kept; six numbers of 16 characters take 101 bytes.
 const VALUE_MAX_BYTES: u32 = 1024;
 /// Most bytes before the pixels: private elements can hold whole reports.
 const HEADER_MAX_BYTES: u64 = 64 << 20;
-/// Most elements, so that a file of empty ones ends.
+/// Most elements of a file, since empty ones take few bytes.
 const ELEMENTS_MAX: u32 = 1 << 20;
-/// Deepest sequences in sequences.
+/// Deepest nesting of sequences.
 const DEPTH_MAX: u32 = 64;
-/// A length that is told by a delimiter.
+/// Length of an element that a delimiter ends.
 const UNDEFINED: u32 = u32::MAX;
 
 /// How pixels are stored.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Pixels {
-    /// So many bytes as they are.
+    /// Uncompressed, with their number of bytes.
     Native(u64),
-    /// Fragments of RLE.
+    /// Run-length encoded, in fragments.
     Rle,
 }
 
-/// A file up to its pixels.
+/// A file read up to its pixels.
 pub(super) struct File {
     values: BTreeMap<Tag, Vec<u8>>,
     pub(super) endian: Endian,
     pub(super) pixels: Pixels,
-    /// What stands from the pixels on.
+    /// Reader at the first byte of the pixels.
     pub(super) rest: Box<dyn BufRead>,
 }
 
-/// Whether these first bytes are DICOM: after 128 bytes of anything, or, as some old programs
-/// write it, without them.
+/// Returns whether the first bytes are DICOM: with the preamble of 128 bytes and `DICM`, or
+/// without, as some old programs write it.
 pub(crate) fn sniff(head: &[u8]) -> bool {
     let bare = head.starts_with(&[8, 0, 0, 0]) || head.starts_with(&[8, 0, 5, 0]);
     head.get(128..132) == Some(b"DICM") || bare && head.len() > 8
 }
 
-/// How elements are written from a place on.
+/// How elements are encoded: with or without their types, and in which byte order.
 #[derive(Clone, Copy)]
 struct Syntax {
     explicit: bool,
     endian: Endian,
 }
 
-struct Walk {
+/// Position in the elements of a file, with the counts that are limited.
+struct ElementReader {
     inner: Box<dyn BufRead>,
-    spent: u64,
+    /// Bytes read or skipped so far.
+    consumed_bytes: u64,
+    /// Elements read so far.
     elements: u32,
 }
 
@@ -98,16 +100,17 @@ impl File {
     pub(super) fn open(mut source: Source) -> Result<File, Problem> {
         let part10 = source.head()?.get(128..132) == Some(b"DICM");
         let len = source.len;
-        let mut walk = Walk { inner: Box::new(source.reader), spent: 0, elements: 0 };
+        let mut reader =
+            ElementReader { inner: Box::new(source.reader), consumed_bytes: 0, elements: 0 };
         let mut values = BTreeMap::new();
         let mut syntax = Syntax { explicit: false, endian: Endian::Little };
         let (mut rle, mut deflated) = (false, false);
         if part10 {
-            walk.skip(132)?;
+            reader.skip(132)?;
             let meta = Syntax { explicit: true, endian: Endian::Little };
-            // The group of meta information is always explicit and little-endian.
-            while walk.peek()? == [2, 0] {
-                walk.element(meta, &mut values, len)?;
+            // The group of file meta information is always explicit little-endian.
+            while reader.peek()? == [2, 0] {
+                reader.element(meta, &mut values, len)?;
             }
             let uid = values.get(&(0x0002, 0x0010)).map(|v| text(v)).unwrap_or_default();
             (syntax, rle, deflated) = match uid.as_str() {
@@ -133,7 +136,7 @@ impl File {
                     ));
                 }
             };
-        } else if walk
+        } else if reader
             .inner
             .fill_buf()
             .is_ok_and(|b| b.len() > 6 && b[4].is_ascii_uppercase() && b[5].is_ascii_uppercase())
@@ -142,13 +145,13 @@ impl File {
         }
         let mut len = len;
         if deflated {
-            // What it becomes is bounded by the limits of a walk and by the pixels' own size.
-            let inner = std::mem::replace(&mut walk.inner, Box::new(std::io::empty()));
-            walk.inner = Box::new(std::io::BufReader::new(DeflateDecoder::new(inner)));
+            // The limits on elements and the pixels' own size bound the inflated data.
+            let inner = std::mem::replace(&mut reader.inner, Box::new(std::io::empty()));
+            reader.inner = Box::new(std::io::BufReader::new(DeflateDecoder::new(inner)));
             len = len.saturating_mul(1032);
         }
         let bytes = loop {
-            if walk.inner.fill_buf().map_err(|e| broken(&e))?.is_empty() {
+            if reader.inner.fill_buf().map_err(|e| broken(&e))?.is_empty() {
                 return Err(Problem::new(
                     OpenErrorKind::NotAVolume,
                     "PixelData",
@@ -156,16 +159,16 @@ impl File {
                     "leave the file out",
                 ));
             }
-            if let Some(bytes) = walk.element(syntax, &mut values, len)? {
+            if let Some(bytes) = reader.element(syntax, &mut values, len)? {
                 break bytes;
             }
         };
         let pixels = match (rle, bytes) {
             (true, UNDEFINED) => Pixels::Rle,
             (false, n) if n != UNDEFINED => {
-                let left = len.saturating_sub(walk.spent);
+                let left = len.saturating_sub(reader.consumed_bytes);
                 if u64::from(n) > left {
-                    return Err(crate::samples::short(n.into(), left));
+                    return Err(crate::samples::truncated(n.into(), left));
                 }
                 Pixels::Native(n.into())
             }
@@ -177,15 +180,15 @@ impl File {
                 ));
             }
         };
-        Ok(File { values, endian: syntax.endian, pixels, rest: walk.inner })
+        Ok(File { values, endian: syntax.endian, pixels, rest: reader.inner })
     }
 
-    /// A value as text.
+    /// Returns a kept value as trimmed text; `None` if it is absent or empty.
     pub(super) fn text(&self, tag: Tag) -> Option<String> {
         self.values.get(&tag).map(|v| text(v)).filter(|t| !t.is_empty())
     }
 
-    /// Decimal numbers, parted by backslashes.
+    /// Parses `N` decimal numbers separated by backslashes; `None` if the element is absent.
     pub(super) fn numbers<const N: usize>(&self, tag: Tag) -> Result<Option<[f64; N]>, Problem> {
         let Some(text) = self.text(tag) else { return Ok(None) };
         let numbers: Option<Vec<f64>> = text
@@ -202,7 +205,7 @@ impl File {
         }
     }
 
-    /// A binary number of 16 bits.
+    /// Returns a kept value as a 16-bit binary number.
     pub(super) fn short(&self, tag: Tag) -> Option<u16> {
         let bytes = *self.values.get(&tag)?.first_chunk::<2>()?;
         Some(match self.endian {
@@ -212,7 +215,7 @@ impl File {
     }
 }
 
-/// What a tag is called.
+/// Returns the name of a kept element.
 pub(super) fn name(tag: Tag) -> &'static str {
     KEPT.iter().find(|(t, _)| *t == tag).map_or("element", |(_, name)| name)
 }
@@ -243,25 +246,25 @@ fn malformed(what: impl Into<String>) -> Problem {
     Problem::malformed("elements", what, "get the file again")
 }
 
-impl Walk {
+impl ElementReader {
     fn bytes<const N: usize>(&mut self) -> Result<[u8; N], Problem> {
         let mut bytes = [0; N];
         self.inner.read_exact(&mut bytes).map_err(|e| broken(&e))?;
-        self.spent += N as u64;
+        self.consumed_bytes += N as u64;
         Ok(bytes)
     }
 
-    /// The next two bytes, not consumed.
+    /// Returns the next two bytes without consuming them.
     fn peek(&mut self) -> Result<[u8; 2], Problem> {
         let chunk = self.inner.fill_buf().map_err(|e| broken(&e))?;
-        // A group's two bytes are split over two buffers at most once in a file; then the
-        // first decides, and the element itself is read whole.
+        // At a buffer's end the second byte may be missing and reads as 0; the group of meta
+        // information lies within the first buffer.
         Ok([chunk.first().copied().unwrap_or(0), chunk.get(1).copied().unwrap_or(0)])
     }
 
     fn skip(&mut self, bytes: u64) -> Result<(), Problem> {
-        self.spent = self.spent.saturating_add(bytes);
-        if self.spent > HEADER_MAX_BYTES {
+        self.consumed_bytes = self.consumed_bytes.saturating_add(bytes);
+        if self.consumed_bytes > HEADER_MAX_BYTES {
             return Err(malformed(format!("take more than {HEADER_MAX_BYTES} bytes")));
         }
         match crate::source::skip_bytes(&mut *self.inner, bytes) {
@@ -287,14 +290,14 @@ impl Walk {
         })
     }
 
-    /// Tag and length of the next element, and whether it is a sequence.
+    /// Reads tag and length of the next element, and whether it is a sequence.
     fn head(&mut self, s: Syntax) -> Result<(Tag, u32, bool), Problem> {
         self.elements += 1;
         if self.elements > ELEMENTS_MAX {
             return Err(malformed(format!("are more than {ELEMENTS_MAX}")));
         }
         let tag = (self.short(s.endian)?, self.short(s.endian)?);
-        // Items and delimiters have no type in any syntax.
+        // Items and delimiters carry no type in any syntax.
         if tag.0 == 0xfffe || !s.explicit {
             return Ok((tag, self.long(s.endian)?, false));
         }
@@ -325,8 +328,8 @@ impl Walk {
         Ok((tag, len, &kind == b"SQ"))
     }
 
-    /// Passes by an element, or keeps its value. `Some` is the length of the pixels, which come
-    /// next. `len` is how many bytes there can be.
+    /// Reads an element, and keeps or skips its value. Returns the length of the pixels if they
+    /// come next. `len` is the most bytes that the file can have.
     fn element(
         &mut self,
         s: Syntax,
@@ -338,16 +341,16 @@ impl Walk {
             return Ok(Some(bytes));
         }
         if bytes == UNDEFINED {
-            self.undefined(s, 1)?;
+            self.skip_undefined(s, 1)?;
             return Ok(None);
         }
-        if u64::from(bytes) > len.saturating_sub(self.spent) {
+        if u64::from(bytes) > len.saturating_sub(self.consumed_bytes) {
             return Err(broken(&std::io::ErrorKind::UnexpectedEof.into()));
         }
         if KEPT.iter().any(|(kept, _)| *kept == tag) && bytes <= VALUE_MAX_BYTES {
             let mut value = vec![0; bytes as usize];
             self.inner.read_exact(&mut value).map_err(|e| broken(&e))?;
-            self.spent += u64::from(bytes);
+            self.consumed_bytes += u64::from(bytes);
             values.insert(tag, value);
         } else {
             self.skip(bytes.into())?;
@@ -355,8 +358,8 @@ impl Walk {
         Ok(None)
     }
 
-    /// Passes by a sequence, or an item of one, up to its delimiter.
-    fn undefined(&mut self, s: Syntax, depth: u32) -> Result<(), Problem> {
+    /// Skips a sequence or item of undefined length, up to its delimiter.
+    fn skip_undefined(&mut self, s: Syntax, depth: u32) -> Result<(), Problem> {
         if depth > DEPTH_MAX {
             return Err(malformed(format!("stand in more than {DEPTH_MAX} sequences")));
         }
@@ -364,7 +367,7 @@ impl Walk {
             let (tag, bytes, _) = self.head(s)?;
             match (tag, bytes) {
                 ((0xfffe, 0xe00d | 0xe0dd), _) => return Ok(()),
-                (_, UNDEFINED) => self.undefined(s, depth + 1)?,
+                (_, UNDEFINED) => self.skip_undefined(s, depth + 1)?,
                 (_, bytes) => self.skip(bytes.into())?,
             }
         }

@@ -1,9 +1,9 @@
-//! DICOM series: a folder of slices, sorted by where they lie, as one volume.
+//! Reader of DICOM series: a folder of slices, sorted by position, becomes one volume.
 //!
-//! Files from outside are parsed in a process of its own ([`serve`]), which may take 512 MiB and
-//! 120 s of processor time, may write no file, and says the series and its samples through a pipe.
-//! Whoever opens a volume names the program that does so
-//! ([`crate::Hints::dicom_reader`]); a library without one has a thread instead.
+//! Files are not trusted, so a process of its own parses them ([`serve`]). It may take 512 MiB and
+//! 120 s of processor time, may write no file, and sends the series and its samples through a pipe.
+//! The caller names the program ([`crate::Hints::dicom_reader`]); without one a thread parses them,
+//! unconfined.
 
 mod elements;
 mod rle;
@@ -17,7 +17,7 @@ pub(crate) use series::one_slice;
 use crate::Opened;
 use crate::error::{OpenErrorKind, Problem};
 use crate::samples::{self, Endian, Layout, Supply};
-use series::Wish;
+use series::SeriesChoice;
 use slabcast_common::volume::{ValueMap, Volume};
 use std::ffi::OsString;
 use std::io::{BufReader, Read, Write};
@@ -25,17 +25,18 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use wire::Preface;
 
-/// Memory of the process that parses: a slice of 16384 x 16384 pixels of 16 bits is 512 MiB and
-/// is refused; one of 8192 x 8192 passes, packed or not.
+/// Memory limit of the parsing process. A slice of 16384 x 16384 pixels of 16 bits (512 MiB) is
+/// refused; one of 8192 x 8192 passes, compressed or not.
 const CHILD_MEMORY_BYTES: u64 = 512 << 20;
 
-/// Processor seconds of that process: 16384 slices of 512 x 512 take some 10.
+/// Processor time limit of the parsing process: 16384 slices of 512 x 512 take some 10 s.
 const CHILD_CPU_SECS: u64 = 120;
 
-/// Bytes that a byte of a file can at most become: two bytes of RLE are up to 128.
+/// Most bytes of samples per byte of a file: two bytes of RLE decode to at most 128.
 const RLE_RATIO: u64 = 64;
 
-/// Opens the wished series of these files (all of them DICOM, of one folder).
+/// Opens one series of these files, which are all DICOM and in `folder`. `series` names it, `file`
+/// is a slice of it, `reader` the command that parses.
 pub(crate) fn open(
     files: &[PathBuf],
     folder: &Path,
@@ -45,19 +46,19 @@ pub(crate) fn open(
 ) -> Result<Opened, Problem> {
     let bytes = files.iter().filter_map(|f| f.metadata().ok()).map(|m| m.len()).sum();
     let Some(program) = reader else {
-        let (from, mut to) = std::io::pipe().map_err(|e| Problem::io("pipe", &e))?;
+        let (receiver, mut sender) = std::io::pipe().map_err(|e| Problem::io("pipe", &e))?;
         return std::thread::scope(|scope| {
             scope.spawn(move || {
-                // Whoever receives tells of a panic: the pipe ends before the series does.
+                // The receiver reports a panic, since the pipe then ends before the series.
                 let _ = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
-                    // A receiver that has gone away has its reasons.
-                    let _ = told(files, &Wish { series, file }, &mut to);
+                    // A receiver that is gone has failed on its own.
+                    let _ = write_series(files, &SeriesChoice { series, file }, &mut sender);
                 }));
             });
-            received(from, bytes).unwrap_or_else(|| Err(ended("it panicked")))
+            read_series(receiver, bytes).unwrap_or_else(|| Err(reader_failed("it panicked")))
         });
     };
-    let [name, args @ ..] = program else { return Err(ended("it has no name")) };
+    let [name, args @ ..] = program else { return Err(reader_failed("it has no name")) };
     let mut command = Command::new(name);
     command.args(args).arg(folder);
     if let Some(series) = series {
@@ -71,42 +72,43 @@ pub(crate) fn open(
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
-        .map_err(|e| ended(&format!("it could not be started: {e}")))?;
-    let mut child = Reaped(child);
-    let Some(from) = child.0.stdout.take() else { return Err(ended("it has no pipe")) };
-    let result = match received(from, bytes) {
-        // Samples that end early, or nothing at all, are the process's end to tell.
+        .map_err(|e| reader_failed(&format!("it could not be started: {e}")))?;
+    let mut child = KillOnDrop(child);
+    let Some(receiver) = child.0.stdout.take() else { return Err(reader_failed("it has no pipe")) };
+    let result = match read_series(receiver, bytes) {
+        // Samples that end early, or nothing at all: the exit status says more.
         Some(Err(problem)) if problem.kind == OpenErrorKind::Damaged => Some(problem),
         Some(result) => return result,
         None => None,
     };
-    // It has ended, or ends now that nobody listens; what it says last is a line.
-    let mut last = String::new();
-    if let Some(said) = child.0.stderr.take() {
-        let _ = said.take(LAST_WORDS_BYTES).read_to_string(&mut last);
+    // The process has ended, or ends now that the pipe is closed.
+    let mut message = String::new();
+    if let Some(stderr) = child.0.stderr.take() {
+        let _ = stderr.take(STDERR_MAX_BYTES).read_to_string(&mut message);
     }
     match (result, child.0.wait()) {
         (Some(problem), Ok(status)) if status.success() => Err(problem),
-        (_, Ok(status)) => Err(ended(&format!("{status} {}", last.trim()))),
-        (_, Err(e)) => Err(ended(&e.to_string())),
+        (_, Ok(status)) => Err(reader_failed(&format!("{status} {}", message.trim()))),
+        (_, Err(e)) => Err(reader_failed(&e.to_string())),
     }
 }
 
-/// As much as is taken of what a process says when it ends badly.
-const LAST_WORDS_BYTES: u64 = 300;
+/// Most bytes taken of the parsing process's error message.
+const STDERR_MAX_BYTES: u64 = 300;
 
-/// A process that does not outlive the one who waits for it.
-struct Reaped(Child);
+/// A child process that is killed and reaped when dropped.
+struct KillOnDrop(Child);
 
-impl Drop for Reaped {
+impl Drop for KillOnDrop {
     fn drop(&mut self) {
-        // Both fail only where it has ended already.
+        // Both fail only if it has ended already.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
 }
 
-fn ended(how: &str) -> Problem {
+/// Returns the error for a parsing process that failed; `how` it ended.
+fn reader_failed(how: &str) -> Problem {
     Problem::new(
         OpenErrorKind::TooLarge,
         "DICOM",
@@ -119,23 +121,28 @@ fn ended(how: &str) -> Problem {
     )
 }
 
-/// Reads what comes through the pipe; `None` where it says nothing, or nonsense.
-fn received(from: impl Read + Send, bytes: u64) -> Option<Result<Opened, Problem>> {
-    let mut from = BufReader::with_capacity(128 << 10, from);
-    let preface = match Preface::read(&mut from)? {
+/// Reads a series from the pipe, of files of `bytes` bytes together; `None` if nothing valid came.
+fn read_series(pipe: impl Read + Send, bytes: u64) -> Option<Result<Opened, Problem>> {
+    let mut pipe = BufReader::with_capacity(128 << 10, pipe);
+    let preface = match Preface::read(&mut pipe)? {
         Ok(preface) => preface,
         Err(problem) => return Some(Err(problem)),
     };
-    Some(volume(preface, &mut from, bytes))
+    Some(read_volume(preface, &mut pipe, bytes))
 }
 
-fn volume(preface: Preface, from: &mut (dyn Read + Send), bytes: u64) -> Result<Opened, Problem> {
+/// Reads the samples after a preface and makes the volume.
+fn read_volume(
+    preface: Preface,
+    pipe: &mut (dyn Read + Send),
+    bytes: u64,
+) -> Result<Opened, Problem> {
     let Preface { name, number, lattice, anatomical, rescale: [slope, intercept], notes, .. } =
         preface;
     let layout = Layout::new(lattice.dims.map(u64::from), number, Endian::Little, "slices")?;
     lattice.check().map_err(|e| Problem::malformed("slices", e, "get the series again"))?;
     let supply = Supply::Encoded { name: "DICOM", bytes, ratio: RLE_RATIO };
-    let (samples, stored) = samples::read(from, supply, &layout).map_err(|mut p| {
+    let (samples, stored) = samples::read(pipe, supply, &layout).map_err(|mut p| {
         p.field = "slices".into();
         p
     })?;
@@ -152,25 +159,30 @@ fn volume(preface: Preface, from: &mut (dyn Read + Send), bytes: u64) -> Result<
     Ok(Opened { volume, notes })
 }
 
-/// Writes the series or why there is none.
-fn told(files: &[PathBuf], wish: &Wish<'_>, out: &mut dyn Write) -> std::io::Result<()> {
-    // Samples that were begun can't be taken back: whoever reads sees them end early.
-    let mut begun = Begun { out, any: false };
-    match series::write(files, wish, &mut begun) {
-        Err(problem) if !begun.any => wire::write_problem(&problem, begun.out),
+/// Writes the chosen series, or the problem that prevents it.
+fn write_series(
+    files: &[PathBuf],
+    choice: &SeriesChoice<'_>,
+    out: &mut dyn Write,
+) -> std::io::Result<()> {
+    // After the first byte a problem can't be written any more; the reader sees an early end.
+    let mut out = WriteTracker { out, started: false };
+    match series::write(files, choice, &mut out) {
+        Err(problem) if !out.started => wire::write_problem(&problem, out.out),
         Err(problem) => Err(std::io::Error::other(problem)),
         Ok(()) => Ok(()),
     }
 }
 
-struct Begun<'a> {
+/// Remembers whether anything was written.
+struct WriteTracker<'a> {
     out: &'a mut dyn Write,
-    any: bool,
+    started: bool,
 }
 
-impl Write for Begun<'_> {
+impl Write for WriteTracker<'_> {
     fn write(&mut self, buf: &[u8]) -> std::io::Result<usize> {
-        self.any = true;
+        self.started = true;
         self.out.write(buf)
     }
 
@@ -179,8 +191,8 @@ impl Write for Begun<'_> {
     }
 }
 
-/// Parses a folder of DICOM files in the process started for it ([`crate::Hints::dicom_reader`]) and
-/// writes one series, or the problem that prevents it, to `out`.
+/// Parses a folder of DICOM files in the process started for it ([`crate::Hints::dicom_reader`])
+/// and writes one series, or the problem that prevents it, to `out`.
 ///
 /// `series` names the series (its number, description, name or UID); `file` is a slice whose series
 /// is meant. First the process limits itself for good, where the system allows it: 512 MiB of
@@ -197,13 +209,13 @@ pub fn serve(
 ) -> std::io::Result<()> {
     confine();
     match crate::folder::dicom_files(folder) {
-        Ok(files) => told(&files, &Wish { series, file }, out),
+        Ok(files) => write_series(&files, &SeriesChoice { series, file }, out),
         Err(problem) => wire::write_problem(&problem, out),
     }
 }
 
-/// Bounds on memory and processor time, and no files to be written. Where the system has none
-/// or refuses, the parser's own limits stand alone.
+/// Limits memory and processor time of this process, and forbids it to write files. Where the
+/// system refuses, only the parser's own limits apply.
 #[cfg(unix)]
 fn confine() {
     use rustix::process::{Resource, Rlimit, setrlimit};

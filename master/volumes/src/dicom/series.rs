@@ -1,4 +1,5 @@
-//! From the files of a folder to one series in order: grouping, sorting, place, and the samples.
+//! Groups the files of a folder into series, sorts the slices of one, places them and writes its
+//! samples.
 
 use super::elements::{File, Pixels, Tag};
 use super::rle;
@@ -12,31 +13,35 @@ use std::collections::BTreeMap;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
-/// One picture: what of it must agree with its neighbours, and where it lies.
+/// One picture of a series, without its pixels. Lengths in mm, positions in LPS.
 struct Slice {
     path: PathBuf,
-    form: Form,
+    format: PixelFormat,
+    /// Slope and intercept from stored numbers to values.
     rescale: [f64; 2],
-    /// Of the middle of the first pixel, and steps to its neighbours in the row and the column.
+    /// Middle of the first pixel, and the steps to the next column and to the next row.
     place: Option<(DVec3, [DVec3; 2])>,
-    /// Pixel distances where no place is said, and of slices.
+    /// Distances of columns, rows and slices, for files without a position.
     spacing: [f64; 3],
+    /// InstanceNumber, the order of slices without a position.
     instance: f64,
 }
 
-/// How pixels are stored.
+/// Size and number format of a picture, the same for all slices of a series.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Form {
+struct PixelFormat {
     columns: u16,
     rows: u16,
-    /// 8, 16 or 32.
+    /// Bits a pixel in the file: 8, 16 or 32.
     allocated: u16,
+    /// Bits that hold the value.
     stored: u16,
+    /// Index of the value's highest bit.
     high: u16,
     signed: bool,
 }
 
-/// A series by what people call it.
+/// A series with its slices and the names that people use for it.
 struct Series {
     uid: String,
     number: String,
@@ -57,18 +62,18 @@ impl Series {
     }
 }
 
-/// What to read.
-pub(crate) struct Wish<'a> {
-    /// Which series, by its number, description, name or UID.
+/// The series to read.
+pub(crate) struct SeriesChoice<'a> {
+    /// Its number, description, name or UID.
     pub(crate) series: Option<&'a str>,
-    /// A file whose series is meant.
+    /// A slice of it.
     pub(crate) file: Option<&'a Path>,
 }
 
-/// Writes the wished series of these files: a preface, then samples in little-endian order.
+/// Writes the chosen series of these files: a preface, then samples in little-endian order.
 pub(super) fn write(
     files: &[PathBuf],
-    wish: &Wish<'_>,
+    choice: &SeriesChoice<'_>,
     out: &mut dyn Write,
 ) -> Result<(), Problem> {
     let (all, left_out, unread) = gather(files)?;
@@ -76,7 +81,7 @@ pub(super) fn write(
     if let (0, Some(problem)) = (total, unread.first()) {
         return Err(problem.clone());
     }
-    let mut series = choose(all, wish)?;
+    let mut series = choose(all, choice)?;
     let name = series.name();
     let mut notes = Vec::new();
     if total > 1 {
@@ -91,55 +96,57 @@ pub(super) fn write(
     let preface = arrange(&mut series, &mut notes)?;
     preface.write(out).map_err(|e| Problem::io("pipe", &e))?;
     for slice in &series.slices {
-        let bytes = pixels(slice, preface.float).map_err(|p| at(&slice.path, p))?;
+        let bytes = pixels(slice, preface.float).map_err(|p| in_file(&slice.path, p))?;
         out.write_all(&bytes).map_err(|e| Problem::io("pipe", &e))?;
     }
     out.flush().map_err(|e| Problem::io("pipe", &e))
 }
 
-/// The problem, with the file's name before its field.
-fn at(path: &Path, mut p: Problem) -> Problem {
+/// Adds the file's name to the field of a problem.
+fn in_file(path: &Path, mut p: Problem) -> Problem {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     p.field = format!("{} {}", quoted(&name), p.field);
     p
 }
 
-/// Looks at all files; also says how many have no picture, and what is wrong with those that are
-/// of a sort that is not read. A damaged one ends it: it may be a slice of what is wanted.
+/// Reads the headers of all files. Returns the series, the number of files without a picture, and
+/// the problems of files of a kind that is not read. A damaged file is an error: it may be a slice
+/// of the chosen series.
 fn gather(files: &[PathBuf]) -> Result<(Vec<Series>, usize, Vec<Problem>), Problem> {
     let mut all: BTreeMap<(String, u16, u16, String), Series> = BTreeMap::new();
     let (mut left_out, mut unread) = (0, Vec::new());
     for path in files {
-        let source = Source::open(path, "file").map_err(|p| at(path, p))?;
+        let source = Source::open(path, "file").map_err(|p| in_file(path, p))?;
         let file = match File::open(source) {
             Ok(file) => file,
-            // DICOMDIR, reports and the like.
+            // DICOMDIR, reports and other files without pixels.
             Err(p) if p.kind == OpenErrorKind::NotAVolume => {
                 left_out += 1;
                 continue;
             }
             Err(p) if p.kind == OpenErrorKind::Unsupported => {
-                unread.push(at(path, p));
+                unread.push(in_file(path, p));
                 continue;
             }
-            Err(p) => return Err(at(path, p)),
+            Err(p) => return Err(in_file(path, p)),
         };
-        let slice = match Slice::of(path, &file) {
+        let slice = match Slice::from_file(path, &file) {
             Ok(slice) => slice,
             Err(p) if p.kind == OpenErrorKind::Unsupported => {
-                unread.push(at(path, p));
+                unread.push(in_file(path, p));
                 continue;
             }
-            Err(p) => return Err(at(path, p)),
+            Err(p) => return Err(in_file(path, p)),
         };
         let get = |tag: Tag| file.text(tag).unwrap_or_default();
-        // A localizer has pictures across each other under one UID.
-        let across = slice.place.map(|(_, [r, c])| {
+        // A localizer has pictures in several orientations under one UID.
+        let orientation = slice.place.map(|(_, [r, c])| {
             let n = r.normalize_or_zero().cross(c.normalize_or_zero());
             format!("{:.2} {:.2} {:.2}", n.x + 0.0, n.y + 0.0, n.z + 0.0)
         });
         let uid = get((0x0020, 0x000e));
-        let key = (uid.clone(), slice.form.columns, slice.form.rows, across.unwrap_or_default());
+        let key =
+            (uid.clone(), slice.format.columns, slice.format.rows, orientation.unwrap_or_default());
         let series = all.entry(key).or_insert_with(|| Series {
             uid,
             number: get((0x0020, 0x0011)),
@@ -152,13 +159,14 @@ fn gather(files: &[PathBuf]) -> Result<(Vec<Series>, usize, Vec<Problem>), Probl
     Ok((all.into_values().collect(), left_out, unread))
 }
 
-fn choose(mut all: Vec<Series>, wish: &Wish<'_>) -> Result<Series, Problem> {
-    // By size, so that localizers stand last in what is listed.
+/// Picks the chosen series, or fails with a list of all.
+fn choose(mut all: Vec<Series>, choice: &SeriesChoice<'_>) -> Result<Series, Problem> {
+    // By size, so that the error lists localizers last.
     all.sort_by_key(|s| std::cmp::Reverse(s.slices.len()));
     let list = |all: &[Series]| {
         let name = |s: &Series| {
             let (name, n) = (s.name(), s.slices.len());
-            // Some scanners call all series alike.
+            // Some scanners give all series the same name.
             let twins = all.iter().filter(|other| other.name() == name).count() > 1;
             let uid = if twins { format!(", UID {}", quoted(&s.uid)) } else { String::new() };
             format!("{} ({n} slice{}{uid})", quoted(&name), if n == 1 { "" } else { "s" })
@@ -177,13 +185,13 @@ fn choose(mut all: Vec<Series>, wish: &Wish<'_>) -> Result<Series, Problem> {
             "give the folder of a series",
         ));
     }
-    if let Some(file) = wish.file {
+    if let Some(file) = choice.file {
         let holds = |s: &Series| s.slices.iter().any(|slice| slice.path == file);
         if let Some(found) = all.iter().position(holds) {
             return Ok(all.swap_remove(found));
         }
     }
-    match wish.series {
+    match choice.series {
         None if all.len() < 2 => Ok(all.swap_remove(0)),
         None => Err(Problem::malformed(
             "--series",
@@ -210,7 +218,7 @@ fn choose(mut all: Vec<Series>, wish: &Wish<'_>) -> Result<Series, Problem> {
 }
 
 impl Slice {
-    fn of(path: &Path, file: &File) -> Result<Slice, Problem> {
+    fn from_file(path: &Path, file: &File) -> Result<Slice, Problem> {
         let need = |tag: Tag| {
             file.short(tag).ok_or_else(|| {
                 Problem::malformed(super::elements::name(tag), "is missing", "get the file again")
@@ -236,7 +244,7 @@ impl Slice {
         let allocated = need((0x0028, 0x0100))?;
         let stored = file.short((0x0028, 0x0101)).unwrap_or(allocated);
         let high = file.short((0x0028, 0x0102)).unwrap_or(stored.saturating_sub(1));
-        let form = Form {
+        let format = PixelFormat {
             columns: need((0x0028, 0x0011))?,
             rows: need((0x0028, 0x0010))?,
             allocated,
@@ -254,7 +262,7 @@ impl Slice {
                 "get the file again",
             ));
         }
-        let sizes = [form.columns.into(), form.rows.into(), 1];
+        let sizes = [format.columns.into(), format.rows.into(), 1];
         Layout::new(sizes, Number::U8, Endian::Little, "Rows, Columns")?;
         let [between_rows, between_columns] = match file.numbers::<2>((0x0028, 0x0030))? {
             Some(spacing) => spacing,
@@ -270,7 +278,7 @@ impl Slice {
         let position = file.numbers::<3>((0x0020, 0x0032))?;
         let directions = file.numbers::<6>((0x0020, 0x0037))?;
         let place = position.zip(directions).map(|(p, d)| {
-            // The first direction is that of a row: from column to column.
+            // The first direction runs along a row, from column to column.
             let row = DVec3::new(d[0], d[1], d[2]) * spacing[0];
             let column = DVec3::new(d[3], d[4], d[5]) * spacing[1];
             (DVec3::from_array(p), [row, column])
@@ -279,17 +287,17 @@ impl Slice {
         let [intercept] = file.numbers::<1>((0x0028, 0x1052))?.unwrap_or([0.0]);
         let rescale = if slope == 0.0 { [1.0, 0.0] } else { [slope, intercept] };
         let instance = file.numbers::<1>((0x0020, 0x0013)).ok().flatten().map_or(0.0, |[n]| n);
-        Ok(Slice { path: path.into(), form, rescale, place, spacing, instance })
+        Ok(Slice { path: path.into(), format, rescale, place, spacing, instance })
     }
 }
 
-/// Sorts the slices and says where they lie.
+/// Sorts the slices, checks that they agree, and returns the preface with their lattice.
 fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Problem> {
     let name = series.name();
     let count = series.slices.len();
     let slices = &mut series.slices;
     let first = &slices[0];
-    let form = first.form;
+    let format = first.format;
     let n = slices.len() as u64;
     if n > DIM_MAX {
         return Err(Problem::new(
@@ -299,15 +307,15 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
             "leave some out",
         ));
     }
-    if let Some(other) = slices.iter().find(|s| s.form != form) {
+    if let Some(other) = slices.iter().find(|s| s.format != format) {
         let wrong = Problem::malformed(
             "BitsStored",
             "is not what the first slice of its series has",
             "leave it out, or convert the series",
         );
-        return Err(at(&other.path, wrong));
+        return Err(in_file(&other.path, wrong));
     }
-    let dims = [u32::from(form.columns), u32::from(form.rows), count as u32];
+    let dims = [u32::from(format.columns), u32::from(format.rows), count as u32];
     let placed = slices.iter().all(|s| s.place.is_some());
     let lattice = if placed {
         let (_, [row, column]) = first.place.expect("all have one");
@@ -340,7 +348,7 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
             }
             _ => normal * slices[0].spacing[2],
         };
-        // LPS to RAS; `+ 0.0` makes of -0.0 a 0.0.
+        // LPS to RAS. Adding zero turns -0.0 into 0.0.
         let ras = |v: DVec3| v * DVec3::new(-1.0, -1.0, 1.0) + DVec3::ZERO;
         Lattice { dims, steps: [ras(row), ras(column), ras(step)], origin: ras(origin) }
     } else {
@@ -354,10 +362,10 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
     lattice
         .check()
         .map_err(|e| Problem::malformed("ImageOrientationPatient", e, "get the series again"))?;
-    // One rescale for all can wait for its turn; several make floats of all samples.
+    // One rescale for all slices goes into the value map; several turn all samples into floats.
     let rescale = slices[0].rescale;
     let float = slices.iter().any(|s| s.rescale != rescale);
-    let number = match (float, form.allocated, form.signed) {
+    let number = match (float, format.allocated, format.signed) {
         (true, ..) => Number::F32,
         (_, 8, false) => Number::U8,
         (_, 8, true) => Number::I8,
@@ -377,35 +385,35 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
     })
 }
 
-/// The samples of a slice, little-endian, as stored or, where `float` says so, rescaled.
+/// Returns the samples of a slice, little-endian: as stored, or rescaled to f32 if `float`.
 fn pixels(slice: &Slice, float: bool) -> Result<Vec<u8>, Problem> {
     let source = Source::open(&slice.path, "file")?;
     let len = source.len;
     let file = File::open(source)?;
-    if Slice::of(&slice.path, &file)?.form != slice.form {
+    if Slice::from_file(&slice.path, &file)?.format != slice.format {
         return Err(Problem::malformed("file", "changed while it was read", "try again"));
     }
     pixels_of(slice, file, len, float)
 }
 
-/// A file's samples, for those who try to break it.
+/// Returns the samples of a file, for the mutants of `fuzz.rs`.
 #[cfg(test)]
 pub(crate) fn one_slice(source: Source) -> Result<Vec<u8>, Problem> {
     let len = source.len;
     let file = File::open(source)?;
-    pixels_of(&Slice::of(Path::new("slice"), &file)?, file, len, true)
+    pixels_of(&Slice::from_file(Path::new("slice"), &file)?, file, len, true)
 }
 
-/// The samples of an open file of `len` bytes.
+/// Returns the samples of an open file of `len` bytes, like [`pixels`].
 fn pixels_of(slice: &Slice, mut file: File, len: u64, float: bool) -> Result<Vec<u8>, Problem> {
-    let form = slice.form;
-    let size = usize::from(form.allocated / 8);
-    let count = usize::from(form.columns) * usize::from(form.rows);
+    let format = slice.format;
+    let size = usize::from(format.allocated / 8);
+    let count = usize::from(format.columns) * usize::from(format.rows);
     let bytes = match file.pixels {
         Pixels::Rle => rle::unpack(&mut *file.rest, count, size)?,
         Pixels::Native(have) => {
             let need = (count * size) as u64;
-            // An odd number of bytes has one more.
+            // An odd number of bytes is padded with one more.
             if have < need || have > need + need % 2 || need / 1032 > len {
                 return Err(Problem::new(
                     OpenErrorKind::Damaged,
@@ -420,7 +428,7 @@ fn pixels_of(slice: &Slice, mut file: File, len: u64, float: bool) -> Result<Vec
                 .read_to_end(&mut bytes)
                 .map_err(|e| Problem::io("PixelData", &e))?;
             if bytes.len() as u64 != need {
-                return Err(crate::samples::short(need, bytes.len() as u64));
+                return Err(crate::samples::truncated(need, bytes.len() as u64));
             }
             if file.endian == Endian::Big {
                 bytes.chunks_exact_mut(size).for_each(<[u8]>::reverse);
@@ -428,18 +436,18 @@ fn pixels_of(slice: &Slice, mut file: File, len: u64, float: bool) -> Result<Vec
             bytes
         }
     };
-    let whole = form.stored == form.allocated && form.high + 1 == form.allocated;
+    let whole = format.stored == format.allocated && format.high + 1 == format.allocated;
     if whole && !float {
         return Ok(bytes);
     }
-    // Bits above and below those that are stored may hold anything (overlays, once).
-    let lift = 32 - u32::from(form.high) - 1;
-    let drop = 32 - u32::from(form.stored);
+    // Bits outside the stored ones may hold anything, such as old overlays.
+    let lift = 32 - u32::from(format.high) - 1;
+    let drop = 32 - u32::from(format.stored);
     let value = |word: &[u8]| -> i64 {
         let mut wide = [0; 4];
         wide[..size].copy_from_slice(word);
         let raised = u32::from_le_bytes(wide) << lift;
-        match form.signed {
+        match format.signed {
             true => (raised as i32 >> drop).into(),
             false => (raised >> drop).into(),
         }

@@ -1,4 +1,4 @@
-//! DICOM files written here, in every transfer syntax that is read.
+//! Tests with DICOM files written in every transfer syntax that is read.
 
 use super::*;
 use glam::DVec3;
@@ -47,8 +47,8 @@ fn element(
     out.extend(value);
 }
 
-/// PackBits by literals alone.
-fn literals(bytes: &[u8]) -> Vec<u8> {
+/// Encodes bytes as PackBits literals.
+fn packbits_literals(bytes: &[u8]) -> Vec<u8> {
     bytes.chunks(128).flat_map(|c| [&[c.len() as u8 - 1][..], c].concat()).collect()
 }
 
@@ -101,8 +101,9 @@ pub(crate) fn slice(
     put((0x28, 0x1053), "DS", &get("slope", "1"));
     let words: Vec<u8> = pixels.iter().flat_map(|p| short(*p as u16)).collect();
     if syntax == Syntax::Rle {
-        let halves =
-            [1, 0].map(|b| literals(&words.iter().skip(b).step_by(2).copied().collect::<Vec<_>>()));
+        let halves = [1, 0].map(|b| {
+            packbits_literals(&words.iter().skip(b).step_by(2).copied().collect::<Vec<_>>())
+        });
         let mut fragment = vec![0; 64];
         fragment[..4].copy_from_slice(&2u32.to_le_bytes());
         fragment[4..8].copy_from_slice(&64u32.to_le_bytes());
@@ -137,7 +138,7 @@ fn pixels(from: i16) -> Vec<i16> {
 }
 
 #[test]
-fn every_syntax_gives_the_same_sorted_series() {
+fn dicom_transfer_syntaxes_give_the_same_sorted_series() {
     let mut first = None;
     for syntax in ALL {
         // Named against their order in space.
@@ -163,7 +164,7 @@ fn every_syntax_gives_the_same_sorted_series() {
 }
 
 #[test]
-fn several_series_are_listed_and_one_is_taken_by_name() {
+fn dicom_lists_several_series_and_opens_one_by_name() {
     let s = |uid, z, number, description| {
         slice(
             Syntax::Implicit,
@@ -193,7 +194,7 @@ fn several_series_are_listed_and_one_is_taken_by_name() {
 }
 
 #[test]
-fn series_that_are_called_alike_are_listed_with_their_uids() {
+fn dicom_lists_series_of_the_same_name_with_their_uids() {
     let more = [("number", "2"), ("description", "t1")];
     let s = |uid, z| slice(Syntax::Explicit, uid, z, &pixels(0), &more);
     let dir = folder(&[("1", s("1.1", 0.0)), ("2", s("1.2", 0.0)), ("3", s("1.2", 1.0))]);
@@ -205,7 +206,7 @@ fn series_that_are_called_alike_are_listed_with_their_uids() {
 }
 
 #[test]
-fn a_rescale_of_each_slice_and_unused_bits_are_honoured() {
+fn dicom_applies_rescale_of_each_slice_and_masks_unused_bits() {
     let s = |z, slope| {
         slice(Syntax::Explicit, "1", z, &[0, 1, 2], &[("slope", slope), ("intercept", "0")])
     };
@@ -221,7 +222,7 @@ fn a_rescale_of_each_slice_and_unused_bits_are_honoured() {
 }
 
 #[test]
-fn what_is_not_read_is_refused_by_file_field_and_remedy() {
+fn dicom_errors_name_file_field_and_remedy() {
     let good = |z| slice(Syntax::Explicit, "1", z, &pixels(0), &[]);
     let with = |z, key, value| slice(Syntax::Explicit, "1", z, &pixels(0), &[(key, value)]);
     let swap = |bytes: Vec<u8>, from: &str, to: &str| {
@@ -254,7 +255,7 @@ fn what_is_not_read_is_refused_by_file_field_and_remedy() {
 }
 
 #[test]
-fn a_reader_that_dies_is_told_of() {
+fn dicom_reader_process_failure_is_reported() {
     let dir = folder(&[("1", slice(Syntax::Implicit, "1", 0.0, &pixels(0), &[]))]);
     for (program, say) in
         [(&["false"][..], "exit status: 1"), (&["/no/such"], "could not be started")]

@@ -1,5 +1,5 @@
-//! What the reading process says before the samples: lines of text, and at last an empty one.
-//! It has looked at strangers' files, so what it says is believed no more than a stranger.
+//! The text that the parsing process sends before the samples: lines up to an empty one. The
+//! process has parsed untrusted files, so its output is checked like an untrusted file.
 
 use crate::error::{OpenErrorKind, Problem};
 use crate::samples::Number;
@@ -7,22 +7,22 @@ use glam::DVec3;
 use slabcast_common::volume::Lattice;
 use std::io::{self, BufRead, Read, Write};
 
-/// A series without its samples.
+/// Description of a series, sent before its samples.
 #[derive(Debug, PartialEq)]
 pub(super) struct Preface {
     pub(super) name: String,
     pub(super) number: Number,
     pub(super) lattice: Lattice,
     pub(super) anatomical: bool,
-    /// Slope and intercept of the stored numbers.
+    /// Slope and intercept from stored numbers to values.
     pub(super) rescale: [f64; 2],
-    /// Whether samples are rescaled already.
+    /// Whether the samples are rescaled already, to f32.
     pub(super) float: bool,
     pub(super) notes: Vec<String>,
 }
 
-/// Longest preface or problem.
-const MAX_BYTES: u64 = 64 << 10;
+/// Most bytes of a preface or problem.
+const PREFACE_MAX_BYTES: u64 = 64 << 10;
 
 const KINDS: [(OpenErrorKind, &str); 7] = [
     (OpenErrorKind::Unreadable, "unreadable"),
@@ -37,15 +37,15 @@ const KINDS: [(OpenErrorKind, &str); 7] = [
 const NUMBERS: [Number; 7] =
     [Number::U8, Number::I8, Number::U16, Number::I16, Number::U32, Number::I32, Number::F32];
 
-/// A line of its own, whatever the text holds.
-fn line(text: &str) -> String {
+/// Replaces control characters, so that the text is one line.
+fn one_line(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
 }
 
-/// Writes a problem in the place of a preface.
+/// Writes a problem instead of a preface.
 pub(super) fn write_problem(p: &Problem, out: &mut dyn Write) -> io::Result<()> {
     let kind = KINDS.iter().find(|(kind, _)| *kind == p.kind).map_or("damaged", |(_, word)| word);
-    let (field, what, remedy) = (line(&p.field), line(&p.what), line(&p.remedy));
+    let (field, what, remedy) = (one_line(&p.field), one_line(&p.what), one_line(&p.remedy));
     write!(out, "problem {kind}\n{field}\n{what}\n{remedy}\n\n")?;
     out.flush()
 }
@@ -59,23 +59,23 @@ impl Preface {
         write!(
             out,
             "series {}\n{} {nx} {ny} {nz} {} {}\n{}\n",
-            line(&self.name),
+            one_line(&self.name),
             self.number.name(),
             u8::from(self.anatomical),
             u8::from(self.float),
             numbers.join(" "),
         )?;
         for note in &self.notes {
-            writeln!(out, "{}", line(note))?;
+            writeln!(out, "{}", one_line(note))?;
         }
         writeln!(out)
     }
 
-    /// Reads what [`Preface::write`] or [`write_problem`] wrote. `None` where nothing came, or
-    /// nonsense: the process has ended badly.
+    /// Reads the output of [`Preface::write`] or [`write_problem`]. `None` if it is missing or
+    /// malformed: the process has failed.
     pub(super) fn read(from: &mut dyn BufRead) -> Option<Result<Preface, Problem>> {
         let mut lines = Vec::new();
-        let mut from = from.take(MAX_BYTES);
+        let mut from = from.take(PREFACE_MAX_BYTES);
         loop {
             let mut line = String::new();
             from.read_line(&mut line).ok()?;
@@ -99,7 +99,7 @@ impl Preface {
         let n: Vec<f64> =
             lines.get(2)?.split(' ').map(|w| w.parse().ok()).collect::<Option<_>>()?;
         let [_, _, _, _, _, _, _, _, _, _, _, _, slope, intercept] = n[..] else { return None };
-        let v = |at: usize| DVec3::new(n[at], n[at + 1], n[at + 2]);
+        let v = |i: usize| DVec3::new(n[i], n[i + 1], n[i + 2]);
         Some(Ok(Preface {
             name: rest.to_string(),
             number,

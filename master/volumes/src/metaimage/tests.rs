@@ -5,11 +5,11 @@ const HEAD: &str = "ObjectType = Image\nNDims = 3\nDimSize = 3 2 1\nElementType 
 
 fn open(header: &str, data: &[u8]) -> Result<Volume, Problem> {
     let bytes = [header.as_bytes(), data].concat();
-    crate::read(Source::memory(bytes), Path::new("."), "test.mha", &crate::Hints::default())
+    crate::read(Source::from_bytes(bytes), Path::new("."), "test.mha", &crate::Hints::default())
 }
 
 #[test]
-fn local_data_are_read_raw_packed_and_as_text() {
+fn metaimage_reads_local_data_raw_compressed_and_as_text() {
     let data = [1, 2, 3, 4, 5, 6];
     let want = Samples::U8(data.to_vec());
     let local = |more: &str| format!("{HEAD}{more}ElementDataFile = LOCAL\n");
@@ -31,7 +31,7 @@ fn local_data_are_read_raw_packed_and_as_text() {
 }
 
 #[test]
-fn rows_of_the_matrix_are_index_axes_in_lps() {
+fn metaimage_transform_matrix_rows_are_index_axes_in_lps() {
     let more = "TransformMatrix = 0 1 0 0 0 1 -1 0 0\nElementSpacing = 1 2 3\nOffset = 4 5 6\n";
     let v = open(&format!("{HEAD}{more}ElementDataFile = LOCAL\n"), &[0; 6]).unwrap();
     assert!(v.anatomical);
@@ -44,7 +44,7 @@ fn rows_of_the_matrix_are_index_axes_in_lps() {
 }
 
 #[test]
-fn types_and_orders_are_as_named() {
+fn metaimage_element_types_and_byte_order() {
     for (kind, name, bytes) in [
         ("MET_CHAR", "int8", 1),
         ("MET_USHORT", "uint16", 2),
@@ -64,7 +64,7 @@ fn types_and_orders_are_as_named() {
 }
 
 #[test]
-fn what_is_not_read_is_refused_by_field_and_remedy() {
+fn metaimage_errors_name_field_and_remedy() {
     let with = |from: &str, to: &str| format!("{HEAD}ElementDataFile = LOCAL\n").replace(from, to);
     for (header, say) in [
         (HEAD.to_string(), "line 5: `\\0\\0\\0\\0\\0\\0` is not `Key = Value`"),

@@ -2,9 +2,9 @@ use super::*;
 use slabcast_common::volume::Samples;
 use std::path::Path;
 
-/// Which affine a test's file has.
+/// The affine of a test file.
 #[derive(Clone, Copy, PartialEq)]
-pub(crate) enum Form {
+pub(crate) enum Affine {
     Spacing,
     Qform,
     Sform,
@@ -51,7 +51,7 @@ impl Writer {
 }
 
 /// A file of samples 0, 1, 2, ... with spacing 1 x 2 x 3.
-pub(crate) fn nifti1(big: bool, datatype: i16, dims: [i16; 3], form: Form) -> Vec<u8> {
+pub(crate) fn nifti1(big: bool, datatype: i16, dims: [i16; 3], affine: Affine) -> Vec<u8> {
     let mut w = Writer { bytes: vec![0; 352], big };
     w.i32(0, 348);
     w.i16(40, 3);
@@ -62,9 +62,9 @@ pub(crate) fn nifti1(big: bool, datatype: i16, dims: [i16; 3], form: Form) -> Ve
     w.i16(70, datatype);
     w.f32(108, 352.0);
     w.bytes[123] = 2;
-    match form {
-        Form::Spacing => {}
-        Form::Qform => {
+    match affine {
+        Affine::Spacing => {}
+        Affine::Qform => {
             // Half a turn about z, left-handed: RAS from an LPS scan of falling slices.
             w.i16(252, 1);
             w.f32(76, -1.0);
@@ -73,7 +73,7 @@ pub(crate) fn nifti1(big: bool, datatype: i16, dims: [i16; 3], form: Form) -> Ve
                 w.f32(268 + 4 * a, 10.0 * (a as f32 + 1.0));
             }
         }
-        Form::Sform => {
+        Affine::Sform => {
             w.i16(254, 2);
             for a in 0..3 {
                 w.f32(280 + 16 * a + 4 * a, a as f32 + 1.0);
@@ -86,7 +86,7 @@ pub(crate) fn nifti1(big: bool, datatype: i16, dims: [i16; 3], form: Form) -> Ve
     w.bytes
 }
 
-/// The same as NIfTI-2, with an sform.
+/// A NIfTI-2 file of samples 0, 1, 2, ... with spacing 1 x 2 x 3 and an sform.
 pub(crate) fn nifti2(big: bool, datatype: i16, dims: [i64; 3]) -> Vec<u8> {
     let mut w = Writer { bytes: vec![0; 544], big };
     w.i32(0, 540);
@@ -107,7 +107,7 @@ pub(crate) fn nifti2(big: bool, datatype: i16, dims: [i64; 3]) -> Vec<u8> {
 }
 
 fn open(bytes: Vec<u8>) -> Result<Volume, Problem> {
-    crate::read(Source::memory(bytes), Path::new("."), "test.nii", &crate::Hints::default())
+    crate::read(Source::from_bytes(bytes), Path::new("."), "test.nii", &crate::Hints::default())
 }
 
 fn put(bytes: &[u8], at: usize, with: &[u8]) -> Vec<u8> {
@@ -117,11 +117,11 @@ fn put(bytes: &[u8], at: usize, with: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn every_type_opens_in_both_orders_and_versions_packed_or_not() {
+fn nifti_types_open_in_both_byte_orders_and_versions() {
     let mut values: Option<Vec<f64>> = None;
     for datatype in [2i16, 4, 8, 16, 64, 256, 512, 768, 1024, 1280] {
         for big in [false, true] {
-            let one = nifti1(big, datatype, [4, 3, 2], Form::Sform);
+            let one = nifti1(big, datatype, [4, 3, 2], Affine::Sform);
             let two = nifti2(big, datatype, [4, 3, 2]);
             let packed = crate::fuzz::gzip(&one);
             let volumes = [one, two, packed].map(|bytes| open(bytes).unwrap());
@@ -138,30 +138,30 @@ fn every_type_opens_in_both_orders_and_versions_packed_or_not() {
 }
 
 #[test]
-fn forms_are_taken_in_the_order_sform_qform_spacing() {
-    let file = |form| nifti1(false, 2, [4, 3, 2], form);
-    let s = open(file(Form::Sform)).unwrap();
+fn nifti_prefers_sform_then_qform_then_spacing() {
+    let file = |affine| nifti1(false, 2, [4, 3, 2], affine);
+    let s = open(file(Affine::Sform)).unwrap();
     assert!(s.anatomical);
     assert_eq!(s.lattice.origin, DVec3::new(-5.0, -6.0, -7.0));
     assert_eq!(s.lattice.steps, [DVec3::X, DVec3::Y * 2.0, DVec3::Z * 3.0]);
-    let q = open(file(Form::Qform)).unwrap();
+    let q = open(file(Affine::Qform)).unwrap();
     assert!(q.anatomical);
     assert_eq!(q.lattice.origin, DVec3::new(10.0, 20.0, 30.0));
     assert_eq!(q.lattice.steps, [-DVec3::X, DVec3::Y * -2.0, DVec3::Z * -3.0]);
-    let p = open(file(Form::Spacing)).unwrap();
+    let p = open(file(Affine::Spacing)).unwrap();
     assert!(!p.anatomical);
     assert_eq!(p.lattice, Lattice::from_spacing([4, 3, 2], [1.0, 2.0, 3.0]));
     // An sform in the file counts for nothing while its code is zero, and first otherwise.
-    let both = put(&file(Form::Sform), 252, &file(Form::Qform)[252..280]);
+    let both = put(&file(Affine::Sform), 252, &file(Affine::Qform)[252..280]);
     assert_eq!(open(put(&both, 254, &[0, 0])).unwrap().lattice.origin.x, 10.0);
     assert_eq!(open(put(&both, 254, &[1, 0])).unwrap().lattice.origin.x, -5.0);
 }
 
 #[test]
-fn a_quaternion_turns_as_its_formula_says() {
+fn nifti_qform_quaternion_is_a_rotation() {
     // A quarter turn about x: j becomes z, k becomes -y.
     let s = std::f32::consts::FRAC_1_SQRT_2;
-    let file = nifti1(false, 2, [4, 3, 2], Form::Qform);
+    let file = nifti1(false, 2, [4, 3, 2], Affine::Qform);
     let file = put(&file, 76, &1f32.to_le_bytes());
     let file = put(&file, 256, &s.to_le_bytes());
     let v = open(put(&file, 264, &[0; 4])).unwrap();
@@ -172,8 +172,8 @@ fn a_quaternion_turns_as_its_formula_says() {
 }
 
 #[test]
-fn slope_and_units_are_applied_and_no_slope_is_no_slope() {
-    let file = nifti1(false, 256, [4, 3, 2], Form::Sform);
+fn nifti_applies_slope_and_units() {
+    let file = nifti1(false, 256, [4, 3, 2], Affine::Sform);
     let with = |slope: f32, inter: f32| {
         let file = put(&file, 112, &slope.to_le_bytes());
         open(put(&file, 116, &inter.to_le_bytes()))
@@ -192,8 +192,8 @@ fn slope_and_units_are_applied_and_no_slope_is_no_slope() {
 }
 
 #[test]
-fn what_is_not_read_is_refused_by_field_and_remedy() {
-    let file = nifti1(false, 2, [4, 3, 2], Form::Sform);
+fn nifti_errors_name_field_and_remedy() {
+    let file = nifti1(false, 2, [4, 3, 2], Affine::Sform);
     for (at, with, say) in [
         (70, &[128, 0][..], "datatype: 128 is RGB colours; convert"),
         (70, &[32, 0], "datatype: 32 is complex"),

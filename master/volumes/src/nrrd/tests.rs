@@ -3,13 +3,13 @@ use crate::fuzz::gzip;
 
 fn open(header: &str, data: &[u8]) -> Result<Volume, Problem> {
     let bytes = [b"NRRD0004\n", header.as_bytes(), b"\n", data].concat();
-    crate::read(Source::memory(bytes), Path::new("."), "test.nrrd", &crate::Hints::default())
+    crate::read(Source::from_bytes(bytes), Path::new("."), "test.nrrd", &crate::Hints::default())
 }
 
 const RAW: &str = "type: uint8\ndimension: 3\nsizes: 3 2 1\nencoding: raw\n";
 
 #[test]
-fn every_name_of_every_type_is_known() {
+fn nrrd_accepts_every_spelling_of_the_sample_types() {
     for (names, kind, bytes) in [
         ("signed char,int8,int8_t", "int8", 1),
         ("uchar,unsigned char,uint8,uint8_t", "uint8", 1),
@@ -38,7 +38,7 @@ fn every_name_of_every_type_is_known() {
 }
 
 #[test]
-fn spaces_become_ras() {
+fn nrrd_spaces_become_ras() {
     let place = "space directions: (1,0,0) (0,2,0) (0,0.5,3)\nspace origin: (10,20,30)\n";
     for (space, signs, anatomical) in [
         ("right-anterior-superior", [1.0, 1.0, 1.0], true),
@@ -70,7 +70,7 @@ fn spaces_become_ras() {
 }
 
 #[test]
-fn axes_of_one_sample_are_squeezed() {
+fn nrrd_drops_axes_of_one_sample() {
     let data: Vec<u8> = (0..6).collect();
     let want = open(&format!("{RAW}spacings: 1 2 3\n"), &data).unwrap();
     let four = |sizes: &str, rest: &str| {
@@ -92,7 +92,7 @@ fn axes_of_one_sample_are_squeezed() {
 }
 
 #[test]
-fn skips_are_of_the_file_when_raw_and_of_the_content_when_gzip() {
+fn nrrd_byte_skip_counts_file_bytes_if_raw_and_decoded_bytes_if_gzip() {
     let data: Vec<u8> = (10..16).collect();
     let want = slabcast_common::volume::Samples::U8(data.clone());
     let junk = [b"one\ntwo\nxyz", &data[..]].concat();
@@ -118,7 +118,7 @@ fn skips_are_of_the_file_when_raw_and_of_the_content_when_gzip() {
 }
 
 #[test]
-fn multi_member_gzip_and_dos_lines_and_strange_fields_are_read() {
+fn nrrd_reads_multi_member_gzip_dos_line_ends_and_unknown_fields() {
     let gz = RAW.replace("raw", "gz") + "flavour: odd\nkey:=x: y\n# sizes: 9 9 9\n";
     let members = [gzip(&[1, 2, 3]), gzip(&[4, 5, 6])].concat();
     let v = open(&gz, &members).unwrap();
@@ -128,7 +128,7 @@ fn multi_member_gzip_and_dos_lines_and_strange_fields_are_read() {
 }
 
 #[test]
-fn every_encoding_gives_the_same_samples() {
+fn nrrd_encodings_give_the_same_samples() {
     let data = [0, 7, 255, 16, 1, 9];
     let want = slabcast_common::volume::Samples::U8(data.to_vec());
     for (name, bytes) in [
@@ -143,7 +143,7 @@ fn every_encoding_gives_the_same_samples() {
         let v = open(&RAW.replace("raw", name), &bytes).unwrap_or_else(|e| panic!("{name}: {e}"));
         assert_eq!(v.samples, want, "{name}");
     }
-    // Text has no byte order, hexadecimal digits have.
+    // The byte order applies to hexadecimal digits, not to decimal text.
     let short = |name: &str| RAW.replace("uint8", "short").replace("raw", name);
     let v = open(&(short("ascii") + "endian: big\n"), b"1 -2 3 4 5 6").unwrap();
     assert_eq!(v.summary.range(), (-2.0, 6.0));
@@ -165,7 +165,7 @@ fn every_encoding_gives_the_same_samples() {
 }
 
 #[test]
-fn lists_of_data_files_are_one_volume() {
+fn nrrd_reads_lists_of_data_files_as_one_volume() {
     let dir = tempfile::tempdir().unwrap();
     let put = |name: &str, bytes: &[u8]| std::fs::write(dir.path().join(name), bytes).unwrap();
     put("s08.raw", &[0, 1, 2, 3, 4, 5, 99]);
@@ -180,7 +180,7 @@ fn lists_of_data_files_are_one_volume() {
         let head = RAW.replace("3 2 1", "3 2 2").replace("raw", encoding);
         [b"NRRD0004\n", head.as_bytes(), more.as_bytes()].concat()
     };
-    let open = |bytes| read(Source::memory(bytes), dir.path(), "v.nhdr");
+    let open = |bytes| read(Source::from_bytes(bytes), dir.path(), "v.nhdr");
     for (encoding, files) in [
         ("raw", "data file: LIST\ns08.raw\ns10.raw\n"),
         ("raw", "data file: s%02d.raw 8 10 2\n"),
@@ -210,7 +210,7 @@ fn lists_of_data_files_are_one_volume() {
 }
 
 #[test]
-fn what_is_not_read_is_refused_by_field_and_remedy() {
+fn nrrd_errors_name_field_and_remedy() {
     let with = |from: &str, to: &str| RAW.replace(from, to);
     for (header, say) in [
         (with("raw", "zrl"), "encoding (line 5): zrl is not read; save"),
@@ -252,9 +252,9 @@ fn what_is_not_read_is_refused_by_field_and_remedy() {
         assert!(e.contains(say), "want {say:?} in {e}");
     }
     let bytes = b"NRRD0009\n".to_vec();
-    let e = read(Source::memory(bytes), Path::new("."), "t").unwrap_err().to_string();
+    let e = read(Source::from_bytes(bytes), Path::new("."), "t").unwrap_err().to_string();
     assert!(e.contains("line 1: `NRRD0009` is not NRRD0001 to NRRD0005"), "{e}");
     let endless = [b"NRRD0004\n".to_vec(), b"#xxxxxxx\n".repeat(1 << 17)].concat();
-    let e = read(Source::memory(endless), Path::new("."), "t").unwrap_err().to_string();
+    let e = read(Source::from_bytes(endless), Path::new("."), "t").unwrap_err().to_string();
     assert!(e.contains("does not end within 1048576 bytes"), "{e}");
 }

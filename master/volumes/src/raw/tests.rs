@@ -2,7 +2,7 @@ use super::*;
 use slabcast_common::volume::Samples;
 
 fn open(name: &str, hints: &RawHints, bytes: &[u8]) -> Result<Volume, Problem> {
-    read(Source::memory(bytes.to_vec()), bytes.starts_with(&[0x1f, 0x8b]), name, hints)
+    read(Source::from_bytes(bytes.to_vec()), bytes.starts_with(&[0x1f, 0x8b]), name, hints)
 }
 
 #[test]

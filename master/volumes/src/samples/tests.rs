@@ -14,7 +14,7 @@ fn values((samples, map): &(Samples, ValueMap)) -> Vec<f64> {
     (0..samples.len()).map(|i| map.value(samples.code(i))).collect()
 }
 
-/// A stream whose decoder panics after so many bytes.
+/// A stream whose decoder panics after the given number of bytes.
 struct Panics(usize);
 
 impl Read for Panics {
@@ -27,8 +27,8 @@ impl Read for Panics {
 }
 
 #[test]
-fn panic_of_the_unpacking_thread_is_an_error_of_the_file() {
-    let need = 4 * AHEAD_FROM_BYTES;
+fn panic_in_the_decompressing_thread_fails_the_file() {
+    let need = 4 * THREAD_MIN_BYTES;
     let layout = Layout::new([need, 1, 1], Number::U8, Endian::Little, "sizes").unwrap();
     let supply = Supply::Encoded { name: "gzip", bytes: need, ratio: 64 };
     let error = read(&mut Panics(need as usize / 2), supply, &layout).expect_err("it panics");
@@ -54,7 +54,7 @@ macro_rules! both_orders {
 }
 
 #[test]
-fn every_type_keeps_its_values_in_both_byte_orders() {
+fn sample_types_keep_their_values_in_both_byte_orders() {
     both_orders!(Number::U8, [0u8, 7, 255], Samples::U8(_));
     both_orders!(Number::I8, [-128i8, -1, 0, 127], Samples::U8(_));
     both_orders!(Number::U16, [0u16, 258, 65535], Samples::U16(_));
@@ -71,7 +71,7 @@ fn every_type_keeps_its_values_in_both_byte_orders() {
 }
 
 #[test]
-fn doubles_beyond_f32_are_mapped_and_the_unusual_stays() {
+fn float64_beyond_f32_is_rescaled_and_nan_and_infinity_stay() {
     let inf = f64::INFINITY;
     for (numbers, mapped) in [
         (vec![-1.7e308, 0.0, 1.7e308, f64::NAN, inf, -inf], true),
@@ -103,7 +103,7 @@ fn doubles_beyond_f32_are_mapped_and_the_unusual_stays() {
 }
 
 #[test]
-fn sizes_beyond_the_limits_are_refused_before_memory_is_taken() {
+fn oversized_dimensions_are_refused_before_memory_is_taken() {
     for dims in [[0, 1, 1], [16385, 1, 1], [16384, 16384, 16384], [u64::MAX; 3]] {
         assert!(Layout::new(dims, Number::F64, Endian::Little, "sizes").is_err(), "{dims:?}");
     }

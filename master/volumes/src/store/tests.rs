@@ -113,7 +113,9 @@ proptest! {
         };
         let crop = crop.then(|| {
             let share = Some(f64::from(seed % 7) / 10.0);
-            let crop = Crop { unit: CropUnit::Unit, x: [None, share.map(|s| s + 0.2)], y: [share, None], ..Crop::default() };
+            let x = [None, share.map(|s| s + 0.2)];
+                let crop =
+                    Crop { unit: CropUnit::Unit, x, y: [share, None], ..Crop::default() };
             crop.resolve(&volume.lattice).unwrap()
         });
         check_all(&volume, &BrickNeeds { support, normals, gradients: seed % 3 == 0, crop });

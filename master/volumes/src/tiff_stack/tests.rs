@@ -31,11 +31,11 @@ where
 }
 
 fn open(bytes: Vec<u8>) -> Result<Volume, Problem> {
-    crate::read(Source::memory(bytes), Path::new("."), "t.tif", &crate::Hints::default())
+    crate::read(Source::from_bytes(bytes), Path::new("."), "t.tif", &crate::Hints::default())
 }
 
 #[test]
-fn pages_are_slices_however_packed() {
+fn tiff_pages_become_slices_in_every_compression() {
     for compression in [
         Compression::Uncompressed,
         Compression::Lzw,
@@ -50,7 +50,7 @@ fn pages_are_slices_however_packed() {
 }
 
 #[test]
-fn types_and_descriptions_are_honoured() {
+fn tiff_sample_types_and_imagej_and_ome_spacing() {
     let ij = "ImageJ=1.53\nimages=1\nunit=micron\nspacing=3\n";
     let v = open(one::<colortype::Gray32Float>(2, 1, &[-1.5, 2.0], ij)).unwrap();
     assert_eq!((v.file_type.as_str(), v.summary.range()), ("float32", (-1.5, 2.0)));
@@ -73,7 +73,7 @@ fn types_and_descriptions_are_honoured() {
 }
 
 #[test]
-fn a_folder_is_sorted_by_number_and_must_be_of_one_kind() {
+fn tiff_folder_is_sorted_by_number_and_must_have_pages_of_one_kind() {
     let dir = tempfile::tempdir().unwrap();
     let put = |name: &str, bytes: &[u8]| std::fs::write(dir.path().join(name), bytes).unwrap();
     for (name, value) in [("s 10.tif", 3), ("s 9.tif", 2), ("S 1.tiff", 1)] {

@@ -1,39 +1,42 @@
-//! zlib blocks one after another, each of a size that is known before and after packing; and text
-//! that ends with the next tag.
+//! Readers of zlib blocks, each of known compressed and decoded size, and of text up to the next
+//! tag.
 
 use crate::error::{OpenErrorKind, Problem};
 use crate::unpack::wrapped;
 use flate2::read::ZlibDecoder;
 use std::io::{BufRead, Read, Take};
 
-/// Where a block's bytes come from: between two blocks, or through the one that is unpacked.
+/// Position in the data: between two blocks, inside one, or after an error.
 enum State {
     Between(Box<dyn Read + Send>),
     Inside(ZlibDecoder<Take<Box<dyn Read + Send>>>),
     Done,
 }
 
+/// Decodes zlib blocks one after another.
 pub(super) struct Blocks {
     state: State,
-    /// Packed size of each block.
+    /// Compressed size of each block, in bytes.
     packed: Vec<u64>,
-    /// Unpacked size of each but the last; and of the last, 0 where it is whole.
+    /// Decoded bytes of each block but the last.
     size: u64,
+    /// Decoded bytes of the last block; 0 if it is whole.
     last: u64,
-    /// The block that is unpacked or comes next, and what of it has not come yet.
-    at: usize,
+    /// Index of the current or next block.
+    block: usize,
+    /// Decoded bytes of the current block still to come.
     left: u64,
 }
 
 impl Blocks {
     pub(super) fn new(inner: Box<dyn Read + Send>, packed: Vec<u64>, size: u64, last: u64) -> Self {
-        Blocks { state: State::Between(inner), packed, size, last, at: 0, left: 0 }
+        Blocks { state: State::Between(inner), packed, size, last, block: 0, left: 0 }
     }
 
     fn damaged(&self, what: &str) -> std::io::Error {
         wrapped(Problem::new(
             OpenErrorKind::Damaged,
-            format!("block {} of {}", self.at + 1, self.packed.len()),
+            format!("block {} of {}", self.block + 1, self.packed.len()),
             what,
             "get the file again",
         ))
@@ -49,8 +52,8 @@ impl Read for Blocks {
             match std::mem::replace(&mut self.state, State::Done) {
                 State::Done => return Ok(0),
                 State::Between(inner) => {
-                    let Some(&packed) = self.packed.get(self.at) else { return Ok(0) };
-                    let last = self.at + 1 == self.packed.len() && self.last > 0;
+                    let Some(&packed) = self.packed.get(self.block) else { return Ok(0) };
+                    let last = self.block + 1 == self.packed.len() && self.last > 0;
                     self.left = if last { self.last } else { self.size };
                     self.state = State::Inside(ZlibDecoder::new(inner.take(packed)));
                 }
@@ -69,7 +72,7 @@ impl Read for Blocks {
                     return Ok(n);
                 }
                 State::Inside(mut decoder) => {
-                    // Its checksum is looked at on the way to its end.
+                    // Reading to the end verifies the checksum.
                     match decoder.read(&mut [0]) {
                         Ok(0) => {}
                         Ok(_) => return Err(self.damaged("goes on after its size")),
@@ -78,14 +81,14 @@ impl Read for Blocks {
                     let mut rest = decoder.into_inner();
                     std::io::copy(&mut rest, &mut std::io::sink())?;
                     self.state = State::Between(rest.into_inner());
-                    self.at += 1;
+                    self.block += 1;
                 }
             }
         }
     }
 }
 
-/// What stands before the next `<`.
+/// Reads text up to the next `<`.
 pub(super) struct UntilTag<R> {
     pub(super) inner: R,
 }

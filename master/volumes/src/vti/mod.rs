@@ -1,12 +1,13 @@
-//! VTK's XML image data (`.vti`): ascii, base64 and appended, plain or in zlib blocks.
+//! Reader of VTK's XML image data (`.vti`): ascii, base64 and appended, plain or in zlib blocks.
 //!
-//! With raw appended data the file is no XML, so it is read as a stream of tags, and the one
-//! array that is drawn is read where it stands: the active scalars of the points, else the first
-//! array of one number a point, else of the cells.
+//! With raw appended data the file is no valid XML, so it is read as a stream of tags. One array is
+//! drawn: the active scalars of the points, else the first array with one number a point, else with
+//! one a cell.
 //!
-//! Binary data begin with a header of 32- or 64-bit numbers (`header_type`): the number of bytes;
-//! or where blocks are packed, their number, the size of a whole one, the size of the last, and
-//! each packed size. In base64 a packed array's header is encoded apart from its blocks.
+//! Binary data begin with a header of 32- or 64-bit numbers (`header_type`). Plain data have the
+//! number of bytes; compressed data have the number of blocks, the size of a whole one, the size of
+//! the last, and each compressed size. In base64 the header of a compressed array is encoded
+//! separately from its blocks.
 
 mod blocks;
 mod tags;
@@ -23,7 +24,7 @@ use tags::{Tag, Tags};
 
 const RESAVE: &str = "save it again as one ImageData piece with VTK or ParaView";
 
-/// Whether these first bytes are VTK XML; of what type is seen later.
+/// Returns whether the first bytes are VTK XML of any type.
 pub(crate) fn sniff(head: &[u8]) -> bool {
     let text = &head[..head.len().min(4096)];
     let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text).trim_ascii_start();
@@ -31,53 +32,53 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
     text.starts_with(b"<VTKFile") || text.starts_with(b"<?xml") && named()
 }
 
-/// Reads a volume from a source at its beginning.
+/// Reads a volume from the start of a source.
 pub(crate) fn read(source: Source, name: &str) -> Result<Volume, Problem> {
     let len = source.len;
     let mut tags = Tags::new(source.reader);
     let (mut file, mut image, mut section) = (None, None, None);
-    // The array that is drawn, where its data are appended further down, and its offset there.
+    // The array to draw, if its data are appended, and its offset in the appended data.
     let mut appended: Option<(Array, u64)> = None;
     let outside = |tag: &Tag| {
         Problem::malformed(tag.name.as_str(), "does not stand inside ImageData", RESAVE)
     };
     while let Some(tag) = tags.next()? {
         match tag.name.as_str() {
-            "VTKFile" => file = Some(File::of(&tag)?),
-            "ImageData" => image = Some(Image::of(&tag)?),
-            "Piece" => image.as_mut().ok_or_else(|| outside(&tag))?.piece(&tag)?,
-            "PointData" => section = Some(Section::of(&tag, false)),
-            "CellData" => section = Some(Section::of(&tag, true)),
+            "VTKFile" => file = Some(File::from_tag(&tag)?),
+            "ImageData" => image = Some(Image::from_tag(&tag)?),
+            "Piece" => image.as_mut().ok_or_else(|| outside(&tag))?.check_piece(&tag)?,
+            "PointData" => section = Some(Section::from_tag(&tag, false)),
+            "CellData" => section = Some(Section::from_tag(&tag, true)),
             "/PointData" | "/CellData" => section = None,
             "DataArray" if appended.is_none() => {
                 let Some(section) = &section else { continue };
-                let Some(array) = section.wants(&tag)? else { continue };
+                let Some(array) = section.select(&tag)? else { continue };
                 let file = file.as_ref().ok_or_else(|| outside(&tag))?;
                 let image = image.as_ref().ok_or_else(|| outside(&tag))?;
-                let stands = match tag.required("format")? {
+                let format = match tag.required("format")? {
                     "appended" => {
                         tag.required("offset")?;
                         let [offset] = tag.numbers::<u64, 1>("offset")?.unwrap_or_default();
                         appended = Some((array, offset));
                         continue;
                     }
-                    "ascii" => Stands::Text,
-                    "binary" => Stands::Base64,
+                    "ascii" => DataFormat::Text,
+                    "binary" => DataFormat::Base64,
                     _ => return Err(tag.bad("format", "ascii, binary or appended")),
                 };
-                let left = len.saturating_sub(tags.at);
-                return finish(file, image, &array, (stands, tags.reader, left), name);
+                let left = len.saturating_sub(tags.offset);
+                return finish(file, image, &array, (format, tags.reader, left), name);
             }
             "AppendedData" => {
                 let Some((array, offset)) = &appended else { break };
                 let file = file.as_ref().ok_or_else(|| outside(&tag))?;
                 let image = image.as_ref().ok_or_else(|| outside(&tag))?;
-                let stands = match tag.required("encoding")? {
-                    "raw" => Stands::Raw,
-                    "base64" => Stands::Base64,
+                let format = match tag.required("encoding")? {
+                    "raw" => DataFormat::Raw,
+                    "base64" => DataFormat::Base64,
                     _ => return Err(tag.bad("encoding", "raw or base64")),
                 };
-                let left = if tags.skip_past(b'_')? { len.saturating_sub(tags.at) } else { 0 };
+                let left = if tags.skip_past(b'_')? { len.saturating_sub(tags.offset) } else { 0 };
                 if *offset >= left {
                     return Err(Problem::malformed(
                         format!("DataArray {} offset", quoted(&array.name)),
@@ -89,7 +90,7 @@ pub(crate) fn read(source: Source, name: &str) -> Result<Volume, Problem> {
                 reader
                     .seek(SeekFrom::Current(*offset as i64))
                     .map_err(|e| Problem::io("AppendedData", &e))?;
-                return finish(file, image, array, (stands, reader, left - offset), name);
+                return finish(file, image, array, (format, reader, left - offset), name);
             }
             _ => {}
         }
@@ -105,16 +106,17 @@ pub(crate) fn read(source: Source, name: &str) -> Result<Volume, Problem> {
     })
 }
 
-/// What `VTKFile` says.
+/// Attributes of the `VTKFile` element.
 struct File {
     endian: Endian,
-    /// Bytes of a number in a header of data.
-    word: usize,
-    packed: bool,
+    /// Bytes of a number in a data header, 4 or 8.
+    header_word_bytes: usize,
+    /// Whether binary data are zlib blocks.
+    compressed: bool,
 }
 
 impl File {
-    fn of(tag: &Tag) -> Result<File, Problem> {
+    fn from_tag(tag: &Tag) -> Result<File, Problem> {
         if tag.required("type")? != "ImageData" {
             return Err(Problem::unsupported(
                 "VTKFile type",
@@ -127,33 +129,35 @@ impl File {
             Some("BigEndian") => Endian::Big,
             Some(_) => return Err(tag.bad("byte_order", "LittleEndian or BigEndian")),
         };
-        let word = match tag.get("header_type") {
+        let header_word_bytes = match tag.get("header_type") {
             None | Some("UInt32") => 4,
             Some("UInt64") => 8,
             Some(_) => return Err(tag.bad("header_type", "UInt32 or UInt64")),
         };
-        let packed = match tag.get("compressor") {
+        let compressed = match tag.get("compressor") {
             None | Some("") => false,
             Some("vtkZLibDataCompressor") => true,
             Some(_) => {
                 return Err(tag.bad("compressor", "vtkZLibDataCompressor, or leave it out"));
             }
         };
-        Ok(File { endian, word, packed })
+        Ok(File { endian, header_word_bytes, compressed })
     }
 }
 
-/// What `ImageData` and its piece say of where the points lie.
+/// Attributes of `ImageData` and its piece: the grid of points.
 struct Image {
+    /// First and last index along x, y and z.
     extent: [i64; 6],
+    /// Pieces seen so far.
     pieces: u32,
     origin: DVec3,
-    /// From index to world, without the origin.
+    /// Linear map from index to world, without the origin.
     steps: DMat3,
 }
 
 impl Image {
-    fn of(tag: &Tag) -> Result<Image, Problem> {
+    fn from_tag(tag: &Tag) -> Result<Image, Problem> {
         tag.required("WholeExtent")?;
         let extent = tag.numbers("WholeExtent")?.unwrap_or_default();
         let spacing = DVec3::from_array(tag.numbers("Spacing")?.unwrap_or([1.0; 3]));
@@ -165,7 +169,8 @@ impl Image {
         Ok(Image { extent, pieces: 0, origin, steps })
     }
 
-    fn piece(&mut self, tag: &Tag) -> Result<(), Problem> {
+    /// Refuses a second piece, or one that is not the whole image.
+    fn check_piece(&mut self, tag: &Tag) -> Result<(), Problem> {
         self.pieces += 1;
         let whole = tag.numbers::<i64, 6>("Extent")?.is_none_or(|e| e == self.extent);
         if self.pieces > 1 || !whole {
@@ -174,8 +179,9 @@ impl Image {
         Ok(())
     }
 
-    /// Sizes and place of the samples of points or cells.
-    fn place(&self, cells: bool) -> Result<([u64; 3], DVec3), Problem> {
+    /// Returns the number of samples along each axis and the position of the first, for points or
+    /// cells.
+    fn dims_and_origin(&self, cells: bool) -> Result<([u64; 3], DVec3), Problem> {
         let e = self.extent;
         let (mut dims, mut first) = ([0; 3], DVec3::ZERO);
         for a in 0..3 {
@@ -187,7 +193,7 @@ impl Image {
                     "save a volume that is not empty",
                 ));
             };
-            // A flat image has one layer of cells. A cell's value is its middle's.
+            // A flat image has one layer of cells. A cell's value belongs to its middle.
             let halved = cells && points > 1;
             dims[a] = points - u64::from(halved);
             first[a] = e[2 * a] as f64 + if halved { 0.5 } else { 0.0 };
@@ -196,8 +202,9 @@ impl Image {
     }
 }
 
-/// `PointData` or `CellData`.
+/// An open `PointData` or `CellData` element.
 struct Section {
+    /// Name of the active scalars.
     scalars: Option<String>,
     cells: bool,
 }
@@ -210,13 +217,13 @@ struct Array {
 }
 
 impl Section {
-    fn of(tag: &Tag, cells: bool) -> Section {
+    fn from_tag(tag: &Tag, cells: bool) -> Section {
         let scalars = tag.get("Scalars").filter(|s| !s.is_empty()).map(String::from);
         Section { scalars, cells }
     }
 
-    /// The array, if it is the one to draw.
-    fn wants(&self, tag: &Tag) -> Result<Option<Array>, Problem> {
+    /// Returns the array of a `DataArray` tag if it is the one to draw.
+    fn select(&self, tag: &Tag) -> Result<Option<Array>, Problem> {
         let name = tag.get("Name").unwrap_or_default();
         let one = matches!(tag.get("NumberOfComponents"), None | Some("" | "0" | "1"));
         match &self.scalars {
@@ -248,9 +255,9 @@ impl Section {
     }
 }
 
-/// How an array's data stand in the file.
+/// Encoding of an array's data in the file.
 #[derive(Clone, Copy, PartialEq)]
-enum Stands {
+enum DataFormat {
     Text,
     Base64,
     Raw,
@@ -261,13 +268,13 @@ fn finish(
     file: &File,
     image: &Image,
     array: &Array,
-    (stands, reader, left): (Stands, BufReader<Box<dyn Stream>>, u64),
+    (format, reader, left): (DataFormat, BufReader<Box<dyn Stream>>, u64),
     name: &str,
 ) -> Result<Volume, Problem> {
-    let (dims, origin) = image.place(array.cells)?;
+    let (dims, origin) = image.dims_and_origin(array.cells)?;
     let layout = Layout::new(dims, array.number, file.endian, "ImageData WholeExtent")?;
     let steps = [image.steps.x_axis, image.steps.y_axis, image.steps.z_axis];
-    // `+ 0.0` makes of -0.0 a 0.0, so that a digest does not depend on it.
+    // Adding zero turns -0.0 into 0.0, which the digest would distinguish.
     let lattice = Lattice {
         dims: layout.dims,
         steps: steps.map(|s| s + DVec3::ZERO),
@@ -276,7 +283,7 @@ fn finish(
     lattice.check().map_err(|e| {
         Problem::malformed("ImageData Spacing", e, "correct the spacing or the axes")
     })?;
-    let (samples, map) = read_array(file, &layout, (stands, reader, left)).map_err(|mut p| {
+    let (samples, map) = read_array(file, &layout, (format, reader, left)).map_err(|mut p| {
         p.field = format!("DataArray {} {}", quoted(&array.name), p.field);
         p
     })?;
@@ -286,24 +293,24 @@ fn finish(
 fn read_array(
     file: &File,
     layout: &Layout,
-    (stands, reader, left): (Stands, BufReader<Box<dyn Stream>>, u64),
+    (format, reader, left): (DataFormat, BufReader<Box<dyn Stream>>, u64),
 ) -> Result<(Samples, ValueMap), Problem> {
-    if stands == Stands::Text {
+    if format == DataFormat::Text {
         let text = Box::new(blocks::UntilTag { inner: reader });
         let (mut reader, supply) =
             Encoding::Ascii.open(text, left, layout.number).map_err(|e| Problem::io("data", &e))?;
         return samples::read(&mut *reader, supply, &Layout { endian: Endian::Little, ..*layout });
     }
-    let mut data = match stands {
-        Stands::Raw => Bytes::Raw(reader),
+    let mut data = match format {
+        DataFormat::Raw => Bytes::Raw(reader),
         _ => Bytes::Base64(Base64::new(reader)),
     };
     let need = layout.bytes();
     let word = |data: &mut Bytes| -> Result<u64, Problem> {
         let mut bytes = [0; 8];
-        data.read_exact(&mut bytes[..file.word])
+        data.read_exact(&mut bytes[..file.header_word_bytes])
             .map_err(|_| Problem::malformed("header", "is cut off", "get the whole file"))?;
-        Ok(match (file.word, file.endian) {
+        Ok(match (file.header_word_bytes, file.endian) {
             (4, Endian::Big) => u64::from_be_bytes(bytes) >> 32,
             (_, Endian::Big) => u64::from_be_bytes(bytes),
             (_, Endian::Little) => u64::from_le_bytes(bytes),
@@ -316,13 +323,15 @@ fn read_array(
             "get the file again, or correct header_type",
         )
     };
-    if !file.packed {
+    if !file.compressed {
         let bytes = word(&mut data)?;
         if bytes != need {
             return Err(differs(bytes));
         }
-        let supply = match stands {
-            Stands::Raw => Supply::Plain { have: left.saturating_sub(file.word as u64) },
+        let supply = match format {
+            DataFormat::Raw => {
+                Supply::Plain { have: left.saturating_sub(file.header_word_bytes as u64) }
+            }
             _ => Supply::Encoded { name: "base64", bytes: left, ratio: 1 },
         };
         return samples::read(&mut data.take(need), supply, layout);
@@ -333,8 +342,8 @@ fn read_array(
     if total != need {
         return Err(differs(total));
     }
-    // Before the list of sizes takes memory: it must be there.
-    if count.saturating_mul(file.word as u64) > left {
+    // The list of sizes must exist before it takes memory.
+    if count.saturating_mul(file.header_word_bytes as u64) > left {
         return Err(Problem::malformed("header", "is cut off", "get the whole file"));
     }
     let mut packed = Vec::new();
@@ -346,13 +355,13 @@ fn read_array(
     }
     let bytes = packed.iter().fold(0u64, |sum, &n| sum.saturating_add(n));
     if bytes > left {
-        return Err(samples::short(bytes, left));
+        return Err(samples::truncated(bytes, left));
     }
     let mut blocks = Blocks::new(Box::new(data), packed, size, last);
     samples::read(&mut blocks, Supply::deflate("zlib", bytes), layout)
 }
 
-/// Binary data as they are, or out of base64.
+/// Binary data, raw or in base64.
 enum Bytes {
     Raw(BufReader<Box<dyn Stream>>),
     Base64(Base64<BufReader<Box<dyn Stream>>>),

@@ -1,15 +1,15 @@
-//! A stream of XML tags, as far as VTK's files need it: names and attributes. Text between tags
-//! is dropped, comments and instructions too. What stands between a tag and the next can be read
-//! from [`Tags::reader`] instead.
+//! A stream of XML tags with names and attributes, as far as VTK's files need it. Skips text
+//! between tags, comments and processing instructions. The text after a tag can be read from
+//! [`Tags::reader`].
 
 use crate::error::{Problem, quoted};
 use crate::source::Stream;
 use std::io::{BufRead, BufReader};
 
-/// Most bytes of tags in a file; text between them is not counted.
+/// Most bytes of tags in a file, without the text between them.
 const TAGS_MAX_BYTES: u64 = 1 << 20;
 
-/// A tag; of `</Name>` the name is `/Name`.
+/// A tag with its attributes. The name of `</Name>` is `/Name`.
 pub(super) struct Tag {
     pub(super) name: String,
     attributes: Vec<(String, String)>,
@@ -30,7 +30,7 @@ impl Tag {
         })
     }
 
-    /// Refuses an attribute that is there.
+    /// Returns an error about an attribute that is present.
     pub(super) fn bad(&self, key: &str, want: &str) -> Problem {
         Problem::malformed(
             format!("{} {key}", self.name),
@@ -39,7 +39,7 @@ impl Tag {
         )
     }
 
-    /// `N` numbers.
+    /// Parses an attribute of `N` numbers; `None` if it is absent.
     pub(super) fn numbers<T: std::str::FromStr, const N: usize>(
         &self,
         key: &str,
@@ -54,19 +54,21 @@ impl Tag {
     }
 }
 
+/// Iterates over the tags of a file.
 pub(super) struct Tags {
     pub(super) reader: BufReader<Box<dyn Stream>>,
-    /// Bytes of the file before what the reader gives next.
-    pub(super) at: u64,
-    spent: u64,
+    /// Bytes of the file read so far.
+    pub(super) offset: u64,
+    /// Bytes of tags read so far.
+    tag_bytes: u64,
 }
 
 impl Tags {
     pub(super) fn new(reader: BufReader<Box<dyn Stream>>) -> Self {
-        Tags { reader, at: 0, spent: 0 }
+        Tags { reader, offset: 0, tag_bytes: 0 }
     }
 
-    /// Drops bytes up to and with the first `end`; false where there is none.
+    /// Skips bytes up to and including the first `end`; false if there is none.
     pub(super) fn skip_past(&mut self, end: u8) -> Result<bool, Problem> {
         loop {
             let chunk = self.reader.fill_buf().map_err(|e| Problem::io("content", &e))?;
@@ -74,9 +76,9 @@ impl Tags {
                 return Ok(false);
             }
             let found = chunk.iter().position(|b| *b == end);
-            let used = found.map_or(chunk.len(), |at| at + 1);
+            let used = found.map_or(chunk.len(), |i| i + 1);
             self.reader.consume(used);
-            self.at += used as u64;
+            self.offset += used as u64;
             if found.is_some() {
                 return Ok(true);
             }
@@ -89,8 +91,8 @@ impl Tags {
             return Err(Problem::malformed("XML", "ends inside a tag", "get the whole file"));
         };
         self.reader.consume(1);
-        (self.at, self.spent) = (self.at + 1, self.spent + 1);
-        if self.spent > TAGS_MAX_BYTES {
+        (self.offset, self.tag_bytes) = (self.offset + 1, self.tag_bytes + 1);
+        if self.tag_bytes > TAGS_MAX_BYTES {
             return Err(Problem::malformed(
                 "XML",
                 format!("has more than {TAGS_MAX_BYTES} bytes of tags before the data"),
@@ -100,7 +102,7 @@ impl Tags {
         Ok(b)
     }
 
-    /// The next tag; none at the end of the file.
+    /// Returns the next tag; `None` at the end of the file.
     pub(super) fn next(&mut self) -> Result<Option<Tag>, Problem> {
         loop {
             if !self.skip_past(b'<')? {
@@ -119,17 +121,17 @@ impl Tags {
                 text.push(b);
             }
             if !matches!(text.first(), Some(b'!' | b'?')) {
-                return Ok(Some(tag(&String::from_utf8_lossy(&text))));
+                return Ok(Some(parse_tag(&String::from_utf8_lossy(&text))));
             }
         }
     }
 }
 
-fn tag(text: &str) -> Tag {
+fn parse_tag(text: &str) -> Tag {
     let text = text.strip_suffix('/').unwrap_or(text);
     let (name, mut rest) = text.split_once(char::is_whitespace).unwrap_or((text, ""));
     let mut attributes = Vec::new();
-    // `key="value"`, whitespace anywhere between; what is not so is left out.
+    // `key="value"` with whitespace anywhere between; anything else is skipped.
     while let Some((key, after)) = rest.split_once('=') {
         let after = after.trim_start();
         let Some(quote) = after.chars().next().filter(|c| matches!(c, '"' | '\'')) else { break };

@@ -1,10 +1,10 @@
-//! VTI files written here, every way that VTK writes them.
+//! Tests with VTI files written in every data format of VTK.
 
 use super::*;
 use crate::fuzz::{base64, zlib};
 use std::path::Path;
 
-/// How a test's array stands in its file.
+/// Data format of a test's array.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Way {
     Ascii,
@@ -86,11 +86,11 @@ pub(crate) fn vti(way: Way, kind: &str, data: &[u8], word: usize, big: bool) -> 
 }
 
 fn open(bytes: Vec<u8>) -> Result<Volume, Problem> {
-    crate::read(Source::memory(bytes), Path::new("."), "test.vti", &crate::Hints::default())
+    crate::read(Source::from_bytes(bytes), Path::new("."), "test.vti", &crate::Hints::default())
 }
 
 #[test]
-fn every_way_in_which_vtk_writes_gives_the_same_samples() {
+fn vti_data_formats_give_the_same_samples() {
     let data: Vec<u8> = (0..30).map(|i| i * 7).collect();
     for way in WAYS {
         for (word, big) in [(4, false), (8, false), (4, true), (8, true)] {
@@ -109,7 +109,7 @@ fn every_way_in_which_vtk_writes_gives_the_same_samples() {
 }
 
 #[test]
-fn values_of_cells_lie_between_the_points() {
+fn vti_cell_values_lie_between_the_points() {
     let file = String::from_utf8(vti(Way::Ascii, "UInt8", &[1, 2, 3, 4, 5, 6, 7, 8], 4, false));
     let file = file.unwrap().replace("PointData", "CellData");
     let v = open(file.replace("Direction", "Dropped").into()).unwrap();
@@ -118,7 +118,7 @@ fn values_of_cells_lie_between_the_points() {
 }
 
 #[test]
-fn what_is_not_read_is_refused_by_field_and_remedy() {
+fn vti_errors_name_field_and_remedy() {
     let data: Vec<u8> = (0..30).collect();
     let text = String::from_utf8(vti(Way::Ascii, "UInt8", &data, 4, false)).unwrap();
     let appended = String::from_utf8(vti(WAYS[6], "UInt8", &data, 4, false)).unwrap();

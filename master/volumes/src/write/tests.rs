@@ -19,7 +19,7 @@ fn again(volume: &Volume, format: Format) -> Volume {
     };
     write(volume, format, &mut bytes, on_progress).unwrap();
     assert_eq!(seen, volume.samples.len() as u64);
-    let source = Source::memory(bytes);
+    let source = Source::from_bytes(bytes);
     crate::read(source, Path::new("."), "x", &crate::Hints::default())
         .unwrap_or_else(|e| panic!("{format:?}: {e}"))
 }

@@ -1,4 +1,4 @@
-//! One Zarr array: what its metadata say, and its chunks into a volume.
+//! One Zarr array: parses its metadata, and decodes its chunks into a volume.
 
 use super::Placed;
 use super::codec::{Codecs, Shard};
@@ -13,12 +13,12 @@ use std::io::{Read, Seek, SeekFrom};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-/// Largest chunk once decoded. Two of them (packed and not) stay below the 64 MiB that reading
+/// Most bytes of a decoded chunk. Two (compressed and decoded) stay below the 64 MiB that reading
 /// may take beside the voxels.
 const CHUNK_MAX_BYTES: u64 = 32 << 20;
-/// Bytes of chunks that are decoded at once on all threads together.
-const AT_ONCE_BYTES: u64 = 48 << 20;
-/// Most axes.
+/// Most bytes of chunks that all threads decode at once.
+const CONCURRENT_MAX_BYTES: u64 = 48 << 20;
+/// Most axes of an array.
 const RANK_MAX: usize = 16;
 
 pub(super) fn is_array(folder: &Path) -> bool {
@@ -29,24 +29,24 @@ pub(super) fn is_array(folder: &Path) -> bool {
     meta.and_then(|m| m.get("node_type")).is_some_and(|t| t.value == "array")
 }
 
-/// An array by its metadata.
+/// An array's metadata.
 pub(super) struct Array {
     folder: PathBuf,
     pub(super) shape: Vec<u64>,
-    /// Of the files; inner chunks of shards are smaller.
+    /// Shape of a chunk file, which holds one chunk or a shard.
     grid: Vec<u64>,
     pub(super) number: Number,
     pub(super) endian: Endian,
-    /// What stands where a chunk is missing, as bytes of a sample, little-endian.
+    /// Sample in place of missing chunks, little-endian.
     fill: [u8; 8],
-    key: Key,
+    key: ChunkKey,
     codecs: Codecs,
     shard: Option<Shard>,
 }
 
-/// How chunks are called.
-struct Key {
-    /// `c/` in version 3, nothing in 2.
+/// How chunk files are named.
+struct ChunkKey {
+    /// First part of the path: `c` in version 3, empty in version 2.
     prefix: &'static str,
     separator: char,
 }
@@ -88,7 +88,7 @@ impl Array {
         }
     }
 
-    /// Shape of what is decoded at a time.
+    /// Returns the shape that is decoded at a time: a chunk, or an inner chunk of a shard.
     fn inner(&self) -> &[u64] {
         self.shard.as_ref().map_or(&self.grid, |s| &s.inner)
     }
@@ -124,8 +124,8 @@ impl Array {
             grid,
             number,
             endian: codecs.endian,
-            fill: fill(meta.get("fill_value"), number)?,
-            key: Key { prefix, separator },
+            fill: fill_bytes(meta.get("fill_value"), number)?,
+            key: ChunkKey { prefix, separator },
             codecs,
             shard,
         })
@@ -157,14 +157,17 @@ impl Array {
             grid,
             number,
             endian,
-            fill: fill(meta.get("fill_value"), number)?,
-            key: Key { prefix: "", separator: separator(meta.get("dimension_separator"), '.')? },
+            fill: fill_bytes(meta.get("fill_value"), number)?,
+            key: ChunkKey {
+                prefix: "",
+                separator: separator(meta.get("dimension_separator"), '.')?,
+            },
             codecs,
             shard: None,
         })
     }
 
-    /// The samples where `placed` has them.
+    /// Reads the samples along the axes of `placed`.
     pub(super) fn read(&self, placed: &Placed) -> Result<(Samples, ValueMap), Problem> {
         let shifted = |offset| ValueMap { scale: 1.0, offset };
         macro_rules! le {
@@ -173,25 +176,33 @@ impl Array {
             };
         }
         Ok(match self.number {
-            Number::U8 => (Samples::U8(self.place(placed, |b| b[0])?), ValueMap::IDENTITY),
-            Number::I8 => (Samples::U8(self.place(placed, |b| b[0] ^ 0x80)?), shifted(-128.0)),
-            Number::U16 => (Samples::U16(self.place(placed, le!(u16))?), ValueMap::IDENTITY),
+            Number::U8 => (Samples::U8(self.collect(placed, |b| b[0])?), ValueMap::IDENTITY),
+            Number::I8 => (Samples::U8(self.collect(placed, |b| b[0] ^ 0x80)?), shifted(-128.0)),
+            Number::U16 => (Samples::U16(self.collect(placed, le!(u16))?), ValueMap::IDENTITY),
             Number::I16 => {
                 let code = |b: &[u8]| le!(u16)(b) ^ 0x8000;
-                (Samples::U16(self.place(placed, code)?), shifted(-32768.0))
+                (Samples::U16(self.collect(placed, code)?), shifted(-32768.0))
             }
-            Number::F32 => (Samples::F32(self.place(placed, le!(f32))?), ValueMap::IDENTITY),
-            // Their range decides how they are kept, so that all are there for a moment.
-            Number::U32 => wide::narrow(self.pieces(placed, le!(u32))?, i128::from)?,
-            Number::I32 => wide::narrow(self.pieces(placed, le!(i32))?, i128::from)?,
-            Number::U64 => wide::narrow(self.pieces(placed, le!(u64))?, i128::from)?,
-            Number::I64 => wide::narrow(self.pieces(placed, le!(i64))?, i128::from)?,
-            Number::F64 => wide::single(self.pieces(placed, le!(f64))?)?,
+            Number::F32 => (Samples::F32(self.collect(placed, le!(f32))?), ValueMap::IDENTITY),
+            // Their range decides the codes, so all are kept in their type first.
+            Number::U32 => {
+                wide::compact_integers(self.collect_pieces(placed, le!(u32))?, i128::from)?
+            }
+            Number::I32 => {
+                wide::compact_integers(self.collect_pieces(placed, le!(i32))?, i128::from)?
+            }
+            Number::U64 => {
+                wide::compact_integers(self.collect_pieces(placed, le!(u64))?, i128::from)?
+            }
+            Number::I64 => {
+                wide::compact_integers(self.collect_pieces(placed, le!(i64))?, i128::from)?
+            }
+            Number::F64 => wide::compact_doubles(self.collect_pieces(placed, le!(f64))?)?,
         })
     }
 
-    /// All samples in one list.
-    fn place<T: Copy + Send + Sync>(
+    /// Returns all samples in one list.
+    fn collect<T: Copy + Send + Sync>(
         &self,
         placed: &Placed,
         code: impl Fn(&[u8]) -> T + Sync,
@@ -199,8 +210,8 @@ impl Array {
         self.layers(placed, 0..self.layer_count(placed), &code)
     }
 
-    /// All samples in pieces of whole layers, which [`wide`] gives back one by one.
-    fn pieces<T: Copy + Send + Sync>(
+    /// Returns all samples in pieces of whole layers, which [`wide`] frees one by one.
+    fn collect_pieces<T: Copy + Send + Sync>(
         &self,
         placed: &Placed,
         code: impl Fn(&[u8]) -> T + Sync,
@@ -208,13 +219,12 @@ impl Array {
         let [nx, ny, _] = placed.dims.map(|n| n as usize);
         let count = self.layer_count(placed);
         let layer = nx * ny * self.depth(placed) * size_of::<T>();
-        let at_once = wide::PIECE_BYTES.div_ceil(layer);
-        let starts = (0..count).step_by(at_once);
-        starts.map(|z| self.layers(placed, z..count.min(z + at_once), &code)).collect()
+        let step = wide::PIECE_BYTES.div_ceil(layer);
+        let starts = (0..count).step_by(step);
+        starts.map(|z| self.layers(placed, z..count.min(z + step), &code)).collect()
     }
 
-    /// Some layers of chunks, decoded chunk by chunk into their places. A layer is a task of its
-    /// own.
+    /// Decodes some layers of chunks, each layer as a task of its own.
     fn layers<T: Copy + Send + Sync>(
         &self,
         placed: &Placed,
@@ -229,9 +239,9 @@ impl Array {
         reserve(&mut out, samples)?;
         out.resize(samples, code(&self.fill[..size]));
         let layer = |(z, out): (usize, &mut [T])| self.layer(placed, layers.start + z, out, code);
-        // Packed and not.
+        // A chunk in memory, compressed and decoded.
         let chunk = 2 * self.inner().iter().product::<u64>() * self.number.bytes();
-        if chunk * rayon::current_num_threads() as u64 <= AT_ONCE_BYTES {
+        if chunk * rayon::current_num_threads() as u64 <= CONCURRENT_MAX_BYTES {
             out.par_chunks_mut(nx * ny * depth).enumerate().try_for_each(layer)?;
         } else {
             out.chunks_mut(nx * ny * depth).enumerate().try_for_each(layer)?;
@@ -239,23 +249,23 @@ impl Array {
         Ok(out)
     }
 
-    /// Samples along z of a layer: of chunks, or of inner chunks of a shard, and then of some that
-    /// lie behind each other, since a shard's index is read for each layer. (A chunk may well
-    /// be deeper than the array.)
+    /// Returns the samples along z of a layer. A layer is one chunk deep, or several inner chunks
+    /// of a shard, since a shard's index is read for each layer. (A chunk may be deeper than the
+    /// array.)
     fn depth(&self, placed: &Placed) -> usize {
         let Some(a) = placed.axes[2] else { return 1 };
         let (inner, grid) = (self.inner()[a], self.grid[a]);
-        // Layers end where shards do.
+        // A layer must not cross the end of a shard.
         let fits = |n: &u64| (grid / inner).is_multiple_of(*n) && inner.saturating_mul(*n) >= 16;
-        let some = (1..=64).find(fits).unwrap_or(1);
-        inner.saturating_mul(some).min(placed.dims[2]) as usize
+        let chunks = (1..=64).find(fits).unwrap_or(1);
+        inner.saturating_mul(chunks).min(placed.dims[2]) as usize
     }
 
     fn layer_count(&self, placed: &Placed) -> usize {
         (placed.dims[2] as usize).div_ceil(self.depth(placed))
     }
 
-    /// The chunks of one layer along z.
+    /// Decodes the chunks of layer `z` into `out`.
     fn layer<T: Copy>(
         &self,
         placed: &Placed,
@@ -263,11 +273,11 @@ impl Array {
         out: &mut [T],
         code: &impl Fn(&[u8]) -> T,
     ) -> Result<(), Problem> {
-        let mut at = vec![0u64; self.shape.len()];
+        let mut cell = vec![0u64; self.shape.len()];
         let depth = self.depth(placed) as u64;
         let layer = z as u64 * depth..(z as u64 + 1) * depth;
         if let Some(a) = placed.axes[2] {
-            at[a] = layer.start / self.grid[a];
+            cell[a] = layer.start / self.grid[a];
         }
         let count =
             |axis: usize| placed.axes[axis].map_or(1, |a| self.shape[a].div_ceil(self.grid[a]));
@@ -275,11 +285,11 @@ impl Array {
             for x in 0..count(0) {
                 for (axis, n) in [(0, x), (1, y)] {
                     if let Some(a) = placed.axes[axis] {
-                        at[a] = n;
+                        cell[a] = n;
                     }
                 }
-                self.file(placed, &at, &layer, out, code).map_err(|mut p| {
-                    p.field = format!("chunk {} {}", self.key.of(&at), p.field);
+                self.read_file(placed, &cell, &layer, out, code).map_err(|mut p| {
+                    p.field = format!("chunk {} {}", self.key.path(&cell), p.field);
                     p
                 })?;
             }
@@ -287,19 +297,20 @@ impl Array {
         Ok(())
     }
 
-    /// The chunk at a place of the grid, or what of the shard there lies in a layer.
-    fn file<T: Copy>(
+    /// Decodes the chunk at grid position `cell`, or the inner chunks of its shard that lie in
+    /// `layer`.
+    fn read_file<T: Copy>(
         &self,
         placed: &Placed,
-        at: &[u64],
+        cell: &[u64],
         layer: &Range<u64>,
         out: &mut [T],
         code: &impl Fn(&[u8]) -> T,
     ) -> Result<(), Problem> {
-        let path = self.folder.join(self.key.of(at));
+        let path = self.folder.join(self.key.path(cell));
         let io = |e: std::io::Error| Problem::io("file", &e);
         let mut file = match std::fs::metadata(&path) {
-            // A chunk that was never written is all fill value.
+            // A chunk that was never written consists of the fill value.
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(()),
             Err(e) => return Err(io(e)),
             Ok(m) if !m.is_file() => {
@@ -314,7 +325,7 @@ impl Array {
         };
         let len = file.metadata().map_err(io)?.len();
         let bytes = (self.inner().iter().product::<u64>() * self.number.bytes()) as usize;
-        let first: Vec<u64> = at.iter().zip(&self.grid).map(|(a, g)| a * g).collect();
+        let first: Vec<u64> = cell.iter().zip(&self.grid).map(|(c, g)| c * g).collect();
         let Some(shard) = &self.shard else {
             let decoded = self.codecs.decode(&mut file, len, bytes)?;
             self.copy(placed, &first, decoded, out, code);
@@ -323,7 +334,7 @@ impl Array {
         let index = shard.index(&mut file, len, &self.grid)?;
         let counts: Vec<u64> = self.grid.iter().zip(&shard.inner).map(|(g, i)| g / i).collect();
         for (n, (offset, size)) in index.into_iter().enumerate() {
-            // Marked as never written.
+            // The mark of an inner chunk that was never written.
             if (offset, size) == (u64::MAX, u64::MAX) {
                 continue;
             }
@@ -356,8 +367,8 @@ impl Array {
         Ok(())
     }
 
-    /// A decoded chunk whose first sample stands at `first` of the array, to its place in `out`,
-    /// which is a layer.
+    /// Copies a decoded chunk, whose first sample has index `first` in the array, into its layer
+    /// `out`.
     fn copy<T: Copy>(
         &self,
         placed: &Placed,
@@ -371,8 +382,8 @@ impl Array {
             decoded.chunks_exact_mut(size).for_each(<[u8]>::reverse);
         }
         let strides = self.codecs.strides(self.inner());
-        // For each of x, y, z: where the chunk begins, how many of its samples are inside, and
-        // how far apart they stand in it.
+        // For each of x, y, z: the chunk's first index, its samples inside the array, and their
+        // stride in the chunk.
         let along = |axis: usize| match placed.axes[axis] {
             None => (0, 1, 0),
             Some(a) => {
@@ -385,21 +396,22 @@ impl Array {
         let depth = self.depth(placed);
         for z in 0..nz {
             for y in 0..ny {
-                let to = (((z0 + z) % depth) * height + y0 + y) * width + x0;
-                let row = &mut out[to..to + nx];
-                let mut from = (z * sz + y * sy) * size;
+                let start = (((z0 + z) % depth) * height + y0 + y) * width + x0;
+                let row = &mut out[start..start + nx];
+                let mut offset = (z * sz + y * sy) * size;
                 for sample in row {
-                    *sample = code(&decoded[from..from + size]);
-                    from += sx * size;
+                    *sample = code(&decoded[offset..offset + size]);
+                    offset += sx * size;
                 }
             }
         }
     }
 }
 
-impl Key {
-    fn of(&self, at: &[u64]) -> String {
-        let numbers = at.iter().map(u64::to_string);
+impl ChunkKey {
+    /// Returns the path of the chunk file at grid position `cell`.
+    fn path(&self, cell: &[u64]) -> String {
+        let numbers = cell.iter().map(u64::to_string);
         let prefix = (!self.prefix.is_empty()).then(|| self.prefix.to_string());
         prefix.into_iter().chain(numbers).collect::<Vec<_>>().join(&self.separator.to_string())
     }
@@ -416,14 +428,14 @@ fn separator(asked: Option<Json>, usual: char) -> Result<char, Problem> {
     }
 }
 
-/// A type of version 3 by its name.
+/// Returns the type that version 3 calls `name`.
 fn number(name: &str) -> Option<Number> {
     let floats = [Number::F32, Number::F64];
     Number::INTEGERS.into_iter().chain(floats).find(|n| n.name() == name)
 }
 
-/// The fill value's bytes.
-fn fill(value: Option<Json>, number: Number) -> Result<[u8; 8], Problem> {
+/// Returns the fill value as little-endian bytes of a sample.
+fn fill_bytes(value: Option<Json>, number: Number) -> Result<[u8; 8], Problem> {
     let mut bytes = [0; 8];
     let Some(json) = value else { return Ok(bytes) };
     let text = json.value.as_str();

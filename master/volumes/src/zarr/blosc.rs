@@ -1,4 +1,4 @@
-//! Blosc 1 containers: blocks of lz4, zstd or zlib, their bytes or bits shuffled.
+//! Decoder of Blosc 1 containers: blocks of lz4, zstd or zlib, with bytes or bits shuffled.
 
 use super::codec::zstd;
 use crate::error::{OpenErrorKind, Problem};
@@ -9,10 +9,10 @@ fn bad(what: impl Into<String>) -> Problem {
     Problem::new(OpenErrorKind::Damaged, "blosc", what, "get the array again")
 }
 
-/// Decodes a container; it may become `most` bytes.
+/// Decodes a container to at most `most` bytes.
 pub(super) fn decode(data: &[u8], most: usize) -> Result<Vec<u8>, Problem> {
     let head: &[u8; 16] = data.first_chunk().ok_or_else(|| bad("is cut off"))?;
-    let word = |at: usize| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
+    let word = |i: usize| u32::from_le_bytes([head[i], head[i + 1], head[i + 2], head[i + 3]]);
     let (flags, type_size) = (head[2], usize::from(head[3]).max(1));
     let (bytes, block, packed) = (word(4) as usize, word(8) as usize, word(12) as usize);
     if bytes > most || packed > data.len() || block == 0 && bytes > 0 {
@@ -23,32 +23,32 @@ pub(super) fn decode(data: &[u8], most: usize) -> Result<Vec<u8>, Problem> {
         return Ok(Vec::new());
     }
     let mut out = Vec::with_capacity(bytes);
-    // Stored as they are, not even shuffled.
+    // Stored bytes are neither compressed nor shuffled.
     if flags & 2 != 0 {
         out.extend(data.get(16..16 + bytes).ok_or_else(|| bad("is cut off"))?);
         return Ok(out);
     }
-    let at = |at: usize| -> Result<usize, Problem> {
-        let bytes = data.get(at..at + 4).and_then(|b| b.try_into().ok());
+    let offset = |i: usize| -> Result<usize, Problem> {
+        let bytes = data.get(i..i + 4).and_then(|b| b.try_into().ok());
         let n = bytes.map(i32::from_le_bytes).and_then(|n| usize::try_from(n).ok());
         n.ok_or_else(|| bad("is cut off"))
     };
     let block = block.min(bytes);
     let mut plain = vec![0; block];
-    for (i, from) in (0..bytes).step_by(block).enumerate() {
-        let size = block.min(bytes - from);
+    for (i, start) in (0..bytes).step_by(block).enumerate() {
+        let size = block.min(bytes - start);
         let whole = size == block;
-        // c-blosc packs the bytes of a type apart where blocks are whole and long enough, and
-        // since 1.11 says so where it does not.
+        // c-blosc compresses each byte of the type separately if a block is whole and long enough;
+        // since 1.11 a flag says where it does not.
         let split = flags & 0x10 == 0 && type_size <= 16 && block / type_size >= 128 && whole;
         let parts = if split { type_size } else { 1 };
-        let mut next = at(16 + 4 * i)?;
+        let mut next = offset(16 + 4 * i)?;
         let plain = &mut plain[..size];
         if !size.is_multiple_of(parts) {
             return Err(bad("has blocks that are not even"));
         }
         for part in plain.chunks_exact_mut(size / parts) {
-            let packed = at(next)?;
+            let packed = offset(next)?;
             let bytes = data.get(next + 4..next + 4 + packed).ok_or_else(|| bad("is cut off"))?;
             next += 4 + packed;
             if packed == part.len() {
@@ -95,7 +95,8 @@ fn unpack(kind: u8, from: &[u8], to: &mut [u8]) -> Result<(), Problem> {
     }
 }
 
-/// First bytes of all, then second bytes of all; what is left over stands as it is.
+/// Undoes the byte shuffle: first bytes of all numbers, then second bytes, and so on. Bytes left
+/// over are not shuffled.
 fn unshuffle(plain: &[u8], size: usize, out: &mut Vec<u8>) {
     let n = plain.len() / size;
     for i in 0..n {
@@ -104,7 +105,7 @@ fn unshuffle(plain: &[u8], size: usize, out: &mut Vec<u8>) {
     out.extend(&plain[n * size..]);
 }
 
-/// First bits of all and so on, for multiples of eight; what is left over stands as it is.
+/// Undoes the bit shuffle of a multiple of eight numbers. Bytes left over are not shuffled.
 fn unshuffle_bits(plain: &[u8], size: usize, out: &mut Vec<u8>) {
     let n = plain.len() / size / 8 * 8;
     let start = out.len();
@@ -144,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn blocks_splits_and_shuffles_are_undone() {
+    fn blosc_decodes_blocks_splits_and_byte_shuffle() {
         let plain: Vec<u8> = (0..1024u32).map(|i| (i * i / 256) as u8).collect();
         let n = 512;
         let shuffled: Vec<u8> =
@@ -180,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn bits_are_shuffled_back() {
+    fn blosc_undoes_the_bit_shuffle() {
         let plain: Vec<u8> = (0..34u8).map(|i| i.wrapping_mul(37)).collect();
         // 17 numbers of two bytes: 16 are shuffled, one is left over.
         let mut bits = vec![0u8; 32];

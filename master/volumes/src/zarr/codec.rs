@@ -1,4 +1,4 @@
-//! From a chunk's bytes to its samples: the codecs of both versions, and the index of a shard.
+//! Codecs of chunks in both versions, and the index of a shard.
 
 use super::blosc;
 use super::json::Json;
@@ -9,46 +9,47 @@ use ruzstd::decoding::StreamingDecoder;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 
-/// A codec of bytes.
+/// A codec from bytes to bytes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Codec {
     Gzip,
     Zlib,
     Zstd,
     Blosc,
-    /// numcodecs' lz4: the size, then a block.
+    /// lz4 of numcodecs: the decoded size, then a block.
     Lz4,
-    /// Four bytes at the end.
+    /// A checksum of four bytes at the end.
     Crc32c,
 }
 
-/// What is done to a chunk, last codec first.
+/// The codecs of a chunk. Decoding applies the last one first.
 #[derive(Clone, Debug)]
 pub(super) struct Codecs {
     pub(super) endian: Endian,
-    /// As written: the first was applied first.
+    /// In the order of encoding.
     list: Vec<Codec>,
-    /// The array's axes in the order in which a chunk stores them, the slowest first.
+    /// Axes of the array in the order of a chunk's storage, the slowest first; `None` is C order.
     order: Option<Vec<usize>>,
 }
 
-/// A shard: a file of inner chunks with an index.
+/// Layout of a shard, a file of inner chunks with an index.
 #[derive(Clone, Debug)]
 pub(super) struct Shard {
+    /// Shape of an inner chunk.
     pub(super) inner: Vec<u64>,
-    /// Where in the file the index stands.
+    /// Whether the index is at the end of the file, not at its start.
     at_end: bool,
-    /// Whether a checksum follows it.
+    /// Whether a checksum follows the index.
     checked: bool,
 }
 
 impl Codecs {
-    /// The codecs of version 3; those inside a shard where there is one.
+    /// Parses the codecs of version 3. With a shard, returns those of its inner chunks.
     pub(super) fn version_3(list: &Json, grid: &[u64]) -> Result<(Codecs, Option<Shard>), Problem> {
         let (mut codecs, mut shard) =
             (Codecs { endian: Endian::Little, list: Vec::new(), order: None }, None);
         for i in 0..list.len() {
-            let codec = list.at(i);
+            let codec = list.entry(i);
             let name = codec.required("name")?;
             let config = codec.get("configuration");
             let get = |key: &str| config.as_ref().and_then(|c| c.get(key));
@@ -75,7 +76,7 @@ impl Codecs {
                     if nested.is_some() {
                         return Err(name.bad("a shard of chunks, not of shards"));
                     }
-                    shard = Some(Shard::of(&config, inner)?);
+                    shard = Some(Shard::from_config(&config, inner)?);
                     codecs = inside;
                 }
                 "sharding_indexed" => return Err(name.bad("the only codec")),
@@ -89,7 +90,7 @@ impl Codecs {
         Ok((codecs, shard))
     }
 
-    /// The compressor of version 2.
+    /// Parses compressor and order of version 2.
     pub(super) fn version_2(meta: &Json, endian: Endian, rank: usize) -> Result<Codecs, Problem> {
         if let Some(filters) = meta.get("filters").filter(|f| f.len() > 0) {
             return Err(filters.bad("no filters"));
@@ -117,7 +118,7 @@ impl Codecs {
         Ok(Codecs { endian, list, order })
     }
 
-    /// How far apart, in samples of a chunk, neighbours along each axis of the array stand.
+    /// Returns the stride, in samples of a chunk, along each axis of the array.
     pub(super) fn strides(&self, shape: &[u64]) -> Vec<usize> {
         let mut strides = vec![1; shape.len()];
         let mut step = 1;
@@ -129,14 +130,14 @@ impl Codecs {
         strides
     }
 
-    /// Decodes what a reader of `len` bytes has; it must become `bytes` bytes.
+    /// Decodes a chunk of `len` bytes, which must become `bytes` bytes.
     pub(super) fn decode(
         &self,
         from: &mut dyn Read,
         len: u64,
         bytes: usize,
     ) -> Result<Vec<u8>, Problem> {
-        // No packing makes much more of anything; what a file has beyond that is not read.
+        // No encoding makes data much larger, so a longer file is refused unread.
         let most = 2 * bytes as u64 + 4096;
         if len > most {
             return Err(damaged(format!("has {len} bytes for {bytes} of samples")));
@@ -144,7 +145,7 @@ impl Codecs {
         let mut data = Vec::with_capacity(len as usize + 1);
         from.take(len).read_to_end(&mut data).map_err(|e| Problem::io("file", &e))?;
         for (i, codec) in self.list.iter().enumerate().rev() {
-            // Between two codecs it may still be packed.
+            // Between two codecs the data may still be compressed.
             let want = if self.list[..i].iter().all(|c| *c == Codec::Crc32c) {
                 bytes + 4 * i
             } else {
@@ -164,15 +165,15 @@ fn damaged(what: String) -> Problem {
 }
 
 impl Codec {
-    /// Decodes; at most `most` bytes come out.
+    /// Decodes data to at most `most` bytes.
     fn decode(self, mut data: Vec<u8>, most: usize) -> Result<Vec<u8>, Problem> {
         let bad = |e: &dyn std::fmt::Display| {
             let text: String = e.to_string().chars().take(100).collect();
             damaged(format!("can't be unpacked ({text})"))
         };
         match self {
-            Codec::Gzip => all(MultiGzDecoder::new(&data[..]), most),
-            Codec::Zlib => all(ZlibDecoder::new(&data[..]), most),
+            Codec::Gzip => read_all(MultiGzDecoder::new(&data[..]), most),
+            Codec::Zlib => read_all(ZlibDecoder::new(&data[..]), most),
             Codec::Zstd => zstd(&data, most),
             Codec::Blosc => blosc::decode(&data, most),
             Codec::Lz4 => {
@@ -188,22 +189,22 @@ impl Codec {
                 Ok(out)
             }
             Codec::Crc32c => {
-                let Some(at) = data.len().checked_sub(4) else {
+                let Some(end) = data.len().checked_sub(4) else {
                     return Err(bad(&"its checksum is cut off"));
                 };
-                if crc32c::crc32c(&data[..at]).to_le_bytes() != data[at..] {
+                if crc32c::crc32c(&data[..end]).to_le_bytes() != data[end..] {
                     return Err(damaged("does not have its checksum".into()));
                 }
-                data.truncate(at);
+                data.truncate(end);
                 Ok(data)
             }
         }
     }
 }
 
-/// All that a reader gives, at most `most` bytes.
-fn all(from: impl Read, most: usize) -> Result<Vec<u8>, Problem> {
-    // Chunks are small enough to ask for at once; what is not filled is never touched.
+/// Reads a reader to its end; fails after `most` bytes.
+fn read_all(from: impl Read, most: usize) -> Result<Vec<u8>, Problem> {
+    // Chunks are small enough to reserve at once; pages that stay empty are never touched.
     let mut out = Vec::with_capacity(most + 1);
     let read = from.take(most as u64 + 1).read_to_end(&mut out);
     read.map_err(|e| {
@@ -216,8 +217,8 @@ fn all(from: impl Read, most: usize) -> Result<Vec<u8>, Problem> {
     }
 }
 
-/// One zstd frame. Its window is memory that a header of six bytes can ask for, so it is looked
-/// at first (RFC 8878, 3.1.1.1).
+/// Decodes a zstd frame to at most `most` bytes. Checks the window size first, since a header of
+/// six bytes can demand that memory (RFC 8878, 3.1.1.1).
 pub(super) fn zstd(data: &[u8], most: usize) -> Result<Vec<u8>, Problem> {
     let cut = || damaged("has no whole zstd header".into());
     if data.get(..4) != Some(&[0x28, 0xb5, 0x2f, 0xfd]) {
@@ -229,14 +230,14 @@ pub(super) fn zstd(data: &[u8], most: usize) -> Result<Vec<u8>, Problem> {
         let base = 1u64 << (10 + (byte >> 3));
         base + base / 8 * u64::from(byte & 7)
     } else {
-        // A single segment: the window is the content, whose size stands after the dictionary.
-        let at = 5 + [0, 1, 2, 4][usize::from(descriptor & 3)];
+        // A single segment: the window is the content, whose size follows the dictionary id.
+        let start = 5 + [0, 1, 2, 4][usize::from(descriptor & 3)];
         let field = [1, 2, 4, 8][usize::from(descriptor >> 6)];
-        let bytes = data.get(at..at + field).ok_or_else(cut)?;
+        let bytes = data.get(start..start + field).ok_or_else(cut)?;
         let size = bytes.iter().rev().fold(0u64, |n, b| n << 8 | u64::from(*b));
         size + if field == 2 { 256 } else { 0 }
     };
-    // Encoders give small contents windows of up to 8 MiB.
+    // Encoders use windows of up to 8 MiB even for small contents.
     if window > (most as u64).max(SKIP_MAX_BYTES) {
         return Err(damaged(format!("asks for a window of {window} bytes")));
     }
@@ -244,9 +245,10 @@ pub(super) fn zstd(data: &[u8], most: usize) -> Result<Vec<u8>, Problem> {
         let text: String = e.to_string().chars().take(100).collect();
         damaged(format!("can't be unpacked ({text})"))
     })?;
-    all(decoder, most)
+    read_all(decoder, most)
 }
 
+/// Parses the axes of a transpose, each once.
 fn permutation(order: &Json, rank: usize) -> Result<Vec<usize>, Problem> {
     let list = order.sizes()?;
     let mut seen = vec![false; rank];
@@ -263,7 +265,7 @@ fn permutation(order: &Json, rank: usize) -> Result<Vec<usize>, Problem> {
 }
 
 impl Shard {
-    fn of(config: &Json, inner: Vec<u64>) -> Result<Shard, Problem> {
+    fn from_config(config: &Json, inner: Vec<u64>) -> Result<Shard, Problem> {
         let at_end = match config.get("index_location") {
             None => true,
             Some(l) if l.value == "end" => true,
@@ -273,7 +275,7 @@ impl Shard {
         let codecs = config.required("index_codecs")?;
         let mut checked = false;
         for i in 0..codecs.len() {
-            let codec = codecs.at(i);
+            let codec = codecs.entry(i);
             match codec.required("name")?.text()? {
                 "bytes" => {
                     let endian = codec.get("configuration").and_then(|c| c.get("endian"));
@@ -288,7 +290,7 @@ impl Shard {
         Ok(Shard { inner, at_end, checked })
     }
 
-    /// Offset and size of each inner chunk of a file of `len` bytes.
+    /// Reads the index of a shard of `len` bytes: offset and size, in bytes, of each inner chunk.
     pub(super) fn index(
         &self,
         file: &mut File,
@@ -302,8 +304,8 @@ impl Shard {
             return Err(damaged(format!("has {len} bytes, less than its index takes")));
         };
         let io = |e: std::io::Error| Problem::io("index", &e);
-        let at = if self.at_end { len - bytes } else { 0 };
-        file.seek(SeekFrom::Start(at)).map_err(io)?;
+        let start = if self.at_end { len - bytes } else { 0 };
+        file.seek(SeekFrom::Start(start)).map_err(io)?;
         let mut data = Vec::new();
         file.take(bytes).read_to_end(&mut data).map_err(io)?;
         if data.len() as u64 != bytes {

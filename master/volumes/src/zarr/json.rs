@@ -1,4 +1,5 @@
-//! Metadata files: JSON that remembers where it stands, so that a refusal can name the field.
+//! Metadata files as JSON. Each value knows its path in the file, so that errors can name the
+//! field.
 
 use crate::error::{Problem, quoted};
 use crate::source::{self, Source};
@@ -6,10 +7,10 @@ use serde_json::Value;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// Longest metadata file; those of real pictures have some KiB.
-const MAX_BYTES: u64 = 1 << 20;
+/// Largest metadata file; those of real pictures have some KiB.
+const METADATA_MAX_BYTES: u64 = 1 << 20;
 
-/// A value and its place in its file.
+/// A value with its path in the file.
 #[derive(Clone, Debug)]
 pub(super) struct Json {
     pub(super) value: Value,
@@ -21,10 +22,10 @@ impl Json {
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let source = Source::open(path, &name)?;
         let mut text = Vec::new();
-        let read = source.reader.take(MAX_BYTES + 1).read_to_end(&mut text);
+        let read = source.reader.take(METADATA_MAX_BYTES + 1).read_to_end(&mut text);
         read.map_err(|e| Problem::io(&name, &e))?;
-        if text.len() as u64 > MAX_BYTES {
-            let what = format!("has more than {MAX_BYTES} bytes");
+        if text.len() as u64 > METADATA_MAX_BYTES {
+            let what = format!("has more than {METADATA_MAX_BYTES} bytes");
             return Err(Problem::malformed(name, what, "give a Zarr folder of pictures"));
         }
         let value = serde_json::from_slice(&text).map_err(|e| {
@@ -51,13 +52,16 @@ impl Json {
         })
     }
 
-    /// Entries of a list; none for anything else.
+    /// Returns the number of entries of a list; 0 for anything else.
     pub(super) fn len(&self) -> usize {
         self.value.as_array().map_or(0, Vec::len)
     }
 
-    /// An entry that is there.
-    pub(super) fn at(&self, i: usize) -> Json {
+    /// Returns an entry of a list.
+    ///
+    /// # Panics
+    /// If `i` is not below [`Json::len`].
+    pub(super) fn entry(&self, i: usize) -> Json {
         self.inside(&format!("[{i}]"), &self.value[i])
     }
 
@@ -74,13 +78,13 @@ impl Json {
         self.value.as_str().ok_or_else(|| self.bad("a text"))
     }
 
-    /// Whole numbers.
+    /// Returns a list of whole numbers.
     pub(super) fn sizes(&self) -> Result<Vec<u64>, Problem> {
         let list = self.value.as_array().map(|l| l.iter().map(Value::as_u64).collect());
         list.flatten().ok_or_else(|| self.bad("a list of sizes"))
     }
 
-    /// `count` finite numbers.
+    /// Returns a list of `count` numbers.
     pub(super) fn numbers(&self, count: usize) -> Result<Vec<f64>, Problem> {
         let list: Option<Vec<f64>> =
             self.value.as_array().and_then(|l| l.iter().map(Value::as_f64).collect());
@@ -88,7 +92,7 @@ impl Json {
     }
 }
 
-/// A folder below `folder` that metadata name.
+/// Returns the folder, below `folder`, that metadata name.
 pub(super) fn path_in(folder: &Path, name: &str) -> Result<PathBuf, Problem> {
-    source::beside(folder, name, "datasets path")
+    source::resolve_in_folder(folder, name, "datasets path")
 }

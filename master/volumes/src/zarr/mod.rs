@@ -1,12 +1,12 @@
-//! Zarr arrays (versions 2 and 3, with shards) and OME-Zarr pyramids, from a folder.
+//! Reader of Zarr arrays (versions 2 and 3, with shards) and OME-Zarr pyramids, from a folder.
 //!
-//! An array is decoded chunk by chunk straight to its place in the volume; a shard's index is
-//! read first, and then one inner chunk after another. Of a pyramid the finest level is taken
-//! that fits the memory it may have.
+//! Chunks are decoded straight to their place in the volume. Of a shard the index is read first,
+//! then one inner chunk after another. Of a pyramid the finest level is read that fits the memory
+//! limit.
 //!
-//! The reader is our own, since a volume needs a corner of the format (regular grids, five
-//! codecs), and the `zarrs` crate adds 75 crates to build, one of them with an advisory (`lru`).
-//! zstd and lz4 are by `ruzstd` and `lz4_flex`, both in Rust.
+//! A volume needs little of the format (regular grids, five codecs), and the `zarrs` crate adds 75
+//! crates to build, one of them with an advisory (`lru`); hence a reader of our own. `ruzstd` and
+//! `lz4_flex`, both in Rust, decode zstd and lz4.
 
 mod array;
 mod blosc;
@@ -21,19 +21,19 @@ use serde_json::Value;
 use slabcast_common::volume::{Lattice, Volume};
 use std::path::Path;
 
-/// Whether a folder is a Zarr node.
+/// Returns whether a folder is a Zarr array or group.
 pub(crate) fn is_node(folder: &Path) -> bool {
     ["zarr.json", ".zarray", ".zgroup", ".zattrs"].iter().any(|f| folder.join(f).is_file())
 }
 
-/// Opens the array or the pyramid that a folder is.
+/// Opens a folder that is an array or a pyramid.
 pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let mut notes = Vec::new();
     if array::is_array(folder) {
         let array = Array::open(folder)?;
-        let placed = Placed::bare(&array)?;
-        // Chunks may be missing, so that no size of files bounds what an array asks for.
+        let placed = Placed::without_metadata(&array)?;
+        // Missing chunks are filled, so the size of the files does not bound the samples.
         let budget = hints.max_bytes.unwrap_or_else(|| free_memory() / 4 * 3);
         if placed.bytes(&array) > budget {
             return Err(Problem::new(
@@ -47,7 +47,7 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     }
     let mut group = folder.to_path_buf();
     let mut scales = multiscales(&group)?;
-    // The layout of bioformats2raw: each picture in a numbered group of its own.
+    // bioformats2raw writes each picture into a numbered group of its own.
     if scales.is_none() && is_node(&folder.join("0")) && !array::is_array(&folder.join("0")) {
         group = folder.join("0");
         scales = multiscales(&group)?;
@@ -63,12 +63,12 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     if scales.len() == 0 {
         return Err(Problem::malformed("multiscales", "is empty", "give the folder of an array"));
     }
-    let image = scales.at(0);
-    let axes = Axes::of(&image)?;
+    let image = scales.entry(0);
+    let axes = Axes::from_image(&image)?;
     let levels = image.required("datasets")?;
     let count = levels.len();
     let open = |level: usize| -> Result<(Array, Placed), Problem> {
-        let dataset = levels.at(level);
+        let dataset = levels.entry(level);
         let array = Array::open(&path_in(&group, dataset.required("path")?.text()?)?)?;
         let placed = axes.place(&array, &image, &dataset)?;
         Ok((array, placed))
@@ -92,7 +92,7 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
                         break;
                     }
                     Ok(_) => {}
-                    // Beyond our own limits, as the finest level of a large picture may well be.
+                    // The finest level of a large picture may exceed the limits; try the next.
                     Err(p) if p.kind == OpenErrorKind::TooLarge && level + 1 < count => {}
                     Err(p) => return Err(p),
                 }
@@ -120,16 +120,16 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     read(array, placed, &name, notes)
 }
 
-/// Where the machine does not say how much memory it has free.
-const BUDGET_BYTES: u64 = 4 << 30;
+/// Free memory to assume where the system does not tell.
+const FREE_MEMORY_BYTES: u64 = 4 << 30;
 
-/// Memory that is free. A pyramid may take a quarter: bricks, encoded bricks and frames need
-/// theirs too.
+/// Returns the free memory in bytes. A level of a pyramid may take a quarter of it, since bricks,
+/// encoded bricks and frames need memory too.
 fn free_memory() -> u64 {
     let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
     let line = text.lines().find(|l| l.starts_with("MemAvailable:"));
     let kib = line.and_then(|l| l.split_ascii_whitespace().nth(1)?.parse::<u64>().ok());
-    kib.map_or(BUDGET_BYTES, |kib| kib * 1024)
+    kib.map_or(FREE_MEMORY_BYTES, |kib| kib * 1024)
 }
 
 fn read(
@@ -152,7 +152,7 @@ fn read(
     Ok(Opened { volume, notes })
 }
 
-/// The list of pictures of a group, if it has one.
+/// Returns the `multiscales` list of a group; `None` if it has none.
 fn multiscales(group: &Path) -> Result<Option<Json>, Problem> {
     let v3 = group.join("zarr.json");
     if v3.is_file() {
@@ -170,11 +170,11 @@ fn multiscales(group: &Path) -> Result<Option<Json>, Problem> {
     Ok(None)
 }
 
-/// Which axes of an array are x, y and z, and where its samples lie.
+/// The axes of an array that are x, y and z, with spacing and origin in mm.
 pub(crate) struct Placed {
-    /// Sizes along x, y, z.
+    /// Samples along x, y and z.
     pub(crate) dims: [u64; 3],
-    /// The array's axis for each of them; none has one sample.
+    /// Index of the array's axis for each; `None` where there is one sample.
     pub(crate) axes: [Option<usize>; 3],
     spacing: [f64; 3],
     origin: [f64; 3],
@@ -182,8 +182,8 @@ pub(crate) struct Placed {
 }
 
 impl Placed {
-    /// The last three axes are z, y, x.
-    fn bare(array: &Array) -> Result<Placed, Problem> {
+    /// Places an array without metadata: its last three axes are z, y, x.
+    fn without_metadata(array: &Array) -> Result<Placed, Problem> {
         let rank = array.shape.len();
         let axes = [1, 2, 3].map(|back| rank.checked_sub(back));
         Placed::new(array, axes, [1.0; 3], [0.0; 3], |_| None)
@@ -209,13 +209,13 @@ impl Placed {
         Ok(Placed { dims, axes, spacing, origin, notes })
     }
 
-    /// Bytes of the samples in the file's type.
+    /// Returns the size of the samples in the file's type, in bytes.
     fn bytes(&self, array: &Array) -> u64 {
         self.dims.iter().product::<u64>() * array.number.bytes()
     }
 }
 
-/// The axes of a picture.
+/// Names and units of a picture's axes.
 struct Axes {
     names: Vec<String>,
     /// Millimetres of an axis's unit.
@@ -223,17 +223,17 @@ struct Axes {
 }
 
 impl Axes {
-    fn of(image: &Json) -> Result<Axes, Problem> {
+    fn from_image(image: &Json) -> Result<Axes, Problem> {
         let mut axes = Axes { names: Vec::new(), mm: Vec::new() };
         let list = image.get("axes");
         let count = list.as_ref().map_or(0, Json::len);
-        // Before version 0.4 axes were words, and before 0.3 always these.
+        // Before version 0.4 axes were plain names, and before 0.3 always these five.
         if count == 0 {
             axes.names = ["t", "c", "z", "y", "x"].map(String::from).to_vec();
             axes.mm = vec![1.0; 5];
         }
         for i in 0..count {
-            let axis = list.as_ref().expect("it has entries").at(i);
+            let axis = list.as_ref().expect("it has entries").entry(i);
             let (name, unit) = match &axis.value {
                 Value::String(name) => (name.clone(), None),
                 _ => (
@@ -253,7 +253,7 @@ impl Axes {
         Ok(axes)
     }
 
-    /// Where a level's samples lie: its own scale and translation, then the picture's.
+    /// Places a level by its own scale and translation, then the picture's.
     fn place(&self, array: &Array, image: &Json, dataset: &Json) -> Result<Placed, Problem> {
         let rank = array.shape.len();
         if self.names.len() != rank {
@@ -275,7 +275,7 @@ impl Axes {
         for owner in [dataset, image] {
             let Some(list) = owner.get("coordinateTransformations") else { continue };
             for i in 0..list.len() {
-                let step = list.at(i);
+                let step = list.entry(i);
                 let numbers = |key: &str| step.get(key).map(|n| n.numbers(rank)).transpose();
                 if let Some(by) = numbers("scale")? {
                     for a in 0..rank {
@@ -288,8 +288,9 @@ impl Axes {
                 }
             }
         }
-        let at = |list: &[f64], or: f64| axes.map(|a| a.map_or(or, |a| list[a] * self.mm[a]));
-        Placed::new(array, axes, at(&scale, 1.0), at(&shift, 0.0), |a| {
+        let in_mm =
+            |list: &[f64], default: f64| axes.map(|a| a.map_or(default, |a| list[a] * self.mm[a]));
+        Placed::new(array, axes, in_mm(&scale, 1.0), in_mm(&shift, 0.0), |a| {
             self.names.get(a).map(|n| quoted(n))
         })
     }

@@ -1,4 +1,4 @@
-//! Zarr folders written here, in both versions.
+//! Tests with Zarr folders written in both versions.
 
 use super::*;
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
@@ -61,7 +61,8 @@ fn packed(bytes: &[u8], how: &str) -> Vec<u8> {
 pub(crate) fn version_2(folder: &Path, how: &str, big: bool, fortran: bool) {
     let compressor = if how == "none" { json!(null) } else { json!({"id": how}) };
     let meta = json!({
-        "zarr_format": 2, "shape": [3, 4, 5], "chunks": [2, 2, 3], "dtype": if big { ">i2" } else { "<i2" },
+        "zarr_format": 2, "shape": [3, 4, 5], "chunks": [2, 2, 3],
+        "dtype": if big { ">i2" } else { "<i2" },
         "compressor": compressor, "fill_value": 0, "filters": null,
         "order": if fortran { "F" } else { "C" }, "dimension_separator": "/",
     });
@@ -90,7 +91,10 @@ pub(crate) fn sharded(folder: &Path) {
     let bytes = |endian: &str| json!({"name": "bytes", "configuration": {"endian": endian}});
     let codecs = json!([{"name": "sharding_indexed", "configuration": {
         "chunk_shape": [1, 2, 5],
-        "codecs": [bytes("little"), {"name": "zstd", "configuration": {"level": 1, "checksum": false}}],
+        "codecs": [
+            bytes("little"),
+            {"name": "zstd", "configuration": {"level": 1, "checksum": false}},
+        ],
         "index_codecs": [bytes("little"), {"name": "crc32c"}],
         "index_location": "end",
     }}]);
@@ -118,7 +122,7 @@ fn values(v: &Volume) -> Vec<i16> {
 }
 
 #[test]
-fn version_2_is_read_in_every_packing_and_order() {
+fn zarr_version_2_is_read_in_every_compression_and_order() {
     for (how, big, fortran) in [
         ("none", false, false),
         ("none", true, true),
@@ -137,7 +141,7 @@ fn version_2_is_read_in_every_packing_and_order() {
 }
 
 #[test]
-fn version_3_is_read_with_its_codecs_shards_and_missing_chunks() {
+fn zarr_version_3_is_read_with_codecs_shards_and_missing_chunks() {
     let dir = tempfile::tempdir().unwrap();
     sharded(dir.path());
     let want: Vec<i16> = (0..60).map(|i| if (20..30).contains(&i) { -7 } else { i }).collect();
@@ -181,7 +185,7 @@ pub(crate) fn pyramid(folder: &Path) {
 }
 
 #[test]
-fn a_level_is_taken_that_fits_and_said() {
+fn zarr_pyramid_opens_the_finest_level_that_fits_and_notes_it() {
     let dir = tempfile::tempdir().unwrap();
     pyramid(dir.path());
     let open = |hints: Hints| crate::open_with(dir.path(), &hints);
@@ -207,7 +211,7 @@ fn a_level_is_taken_that_fits_and_said() {
 }
 
 #[test]
-fn what_is_not_read_is_refused_by_field_and_remedy() {
+fn zarr_errors_name_field_and_remedy() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| -> PathBuf { dir.path().join(name) };
     let array = |name: &str, from: &str, to: &str| {

@@ -11,6 +11,7 @@ mod error;
 mod explain;
 mod formats;
 mod front;
+mod help;
 mod manners;
 mod plan;
 mod program;

@@ -3,9 +3,12 @@
 
 use super::*;
 use slabcast_common::image::Picture;
+use slabcast_common::stats::FrameStats;
 use slabcast_common::volume::Digest32;
 use slabcast_master::finish::view_sha256;
 use slabcast_scene::path::{Turntable, ViewPath};
+use slabcast_session::direct::Cut;
+use slabcast_session::output::Frame;
 use std::collections::BTreeMap;
 use std::sync::mpsc::sync_channel;
 

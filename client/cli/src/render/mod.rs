@@ -3,38 +3,32 @@
 //! Both ways are one loop over [`Update`]s; only where these come from differs ([`Source`]).
 
 mod debug_views;
+mod frame_check;
 #[cfg(test)]
 mod master_cost;
+mod quality;
+mod run;
+mod trace;
 
 use debug_views::DebugView;
+use quality::{choose_here, choose_there};
+use run::Run;
 use slabcast_client::{Client, VolumeDescription};
-use slabcast_common::stats::FrameStats;
-use slabcast_common::volume::{Volume, VolumeInfo};
-use slabcast_lab::autotune::choose::{choose, trial};
-use slabcast_lab::autotune::cluster_bed::{ClusterBed, ClusterRun, Connection};
-use slabcast_lab::autotune::local_bed::{Clock, LocalBed};
+use slabcast_common::volume::Volume;
 use slabcast_scene::path::Orientation;
-use slabcast_scene::request::PathRequest;
-use slabcast_session::direct::Cut;
 use slabcast_session::embedded::{self, Cluster, WorkerGroup};
-use slabcast_session::fail::{Fail, say};
-use slabcast_session::output::provenance::RunProvenance;
-use slabcast_session::output::{DiskWait, Format, Frame, Lines, Output, OutputArgs, Writer};
+use slabcast_session::fail::Fail;
+use slabcast_session::output::{DiskWait, Format, Lines, Output, OutputArgs};
 use slabcast_session::path_scenes::PathScenes;
-use slabcast_session::progress::{self, Progress, Step};
+use slabcast_session::progress::Progress;
 use slabcast_session::record::{self, Recording};
 use slabcast_session::request::{RenderRequest, SceneArgs, WorkArgs};
 use slabcast_session::source::{Cancel, Source, Update};
 use slabcast_session::{remote, runtime, signals, volume};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
-use tokio::runtime::Runtime;
+use std::time::Instant;
 use tokio::sync::mpsc;
-
-/// Time for frames that are being written once the run has failed or was stopped: ten times what
-/// the largest picture takes on a slow disk.
-const LAST: Duration = Duration::from_secs(20);
 
 const SHORT_EXAMPLES: &str = "\
 Examples, and the flags of raw files, kernels, sums, slabs and tiles: slabcast help render";
@@ -121,25 +115,6 @@ pub(crate) struct RenderArgs {
     /// No progress, only warnings and the result
     #[arg(short, long, help_heading = "Output")]
     quiet: bool,
-}
-
-/// State of one run, whoever renders its frames.
-struct Run {
-    request: RenderRequest,
-    /// Whether the up axis was given or needs no note.
-    stands: bool,
-    output: Output,
-    show: Option<DebugView>,
-    patience: Arc<DiskWait>,
-    /// Notes for stderr once the request has been accepted.
-    notes: Vec<String>,
-    stats: Lines,
-    trace: Lines,
-    record: Option<PathBuf>,
-    progress: Progress,
-    began: Instant,
-    /// Whether the run ends with a line that names the pictures.
-    tell: bool,
 }
 
 /// Runs the command.
@@ -235,7 +210,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             let tried = if run.request.target.is_empty() {
                 None
             } else {
-                aim_here(&mut run, &volume, orientation, crew, &runtime, args.quiet)?
+                choose_here(&mut run, &volume, orientation, crew, &runtime, args.quiet)?
             };
             match args.show {
                 None | Some(DebugView::Owner) => {
@@ -250,7 +225,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             let client = runtime.block_on(remote::connect(&master))?;
             let served = runtime.block_on(remote::describe(&client))?;
             if !run.request.target.is_empty() {
-                aim_there(&mut run, &client, &served, &master, &runtime, args.quiet)?;
+                choose_there(&mut run, &client, &served, &master, &runtime, args.quiet)?;
             }
             runtime.block_on(cluster(run, client, served, &master))
         }
@@ -258,62 +233,6 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     };
     runtime::end(runtime);
     result
-}
-
-/// Chooses the quality for a target: errors by the reference, times by a cluster of this process. The
-/// cluster then renders, since it has the bricks.
-fn aim_here(
-    run: &mut Run,
-    volume: &Arc<Volume>,
-    orientation: Orientation,
-    crew: WorkerGroup,
-    runtime: &Runtime,
-    quiet: bool,
-) -> Result<Option<Cluster>, Fail> {
-    let info = volume.info(volume.digest());
-    run.request.fit(&info, orientation, volume.anatomical)?;
-    let (target, threads) = (run.request.target, (crew.workers * crew.threads) as usize);
-    let trial = trial(volume, &info, &run.request, orientation, threads)?;
-    if target.budget.is_none() {
-        let clock = Clock::Plain(Cut { tile: 64, ..Cut::on(threads) });
-        choose(&mut LocalBed::new(trial, clock), &target, quiet)?.settle(&mut run.request);
-        return Ok(None);
-    }
-    let cluster =
-        runtime.block_on(async { Cluster::start(volume.clone(), orientation, crew, None) })?;
-    let (handle, request) = (cluster.handle(), run.request.clone());
-    let wire = Connection::Embedded(&handle);
-    let through = ClusterRun { runtime, wire, info, request, crew: crew.to_string() };
-    match choose(&mut LocalBed::new(trial, Clock::Cluster(Box::new(through))), &target, quiet) {
-        // A record begins with the first worker.
-        Ok(chosen) if run.record.is_none() => {
-            chosen.settle(&mut run.request);
-            Ok(Some(cluster))
-        }
-        chosen => {
-            runtime.block_on(cluster.end());
-            chosen?.settle(&mut run.request);
-            Ok(None)
-        }
-    }
-}
-
-/// Chooses the quality by the cluster's own pictures, where only the master has the volume.
-fn aim_there(
-    run: &mut Run,
-    client: &Client,
-    served: &VolumeDescription,
-    master: &str,
-    runtime: &Runtime,
-    quiet: bool,
-) -> Result<(), Fail> {
-    let info = served.info.clone();
-    run.request.fit(&info, served.orientation, served.anatomical)?;
-    let (target, request) = (run.request.target, run.request.clone());
-    let crew = format!("the cluster of {master}");
-    let through = ClusterRun { runtime, wire: Connection::Remote(client), info, request, crew };
-    choose(&mut ClusterBed::new(through), &target, quiet)?.settle(&mut run.request);
-    Ok(())
 }
 
 /// Renders the request of a picture's provenance in this process. Prints nothing at the end.
@@ -452,300 +371,4 @@ async fn cluster(
     };
     let what = format!("{} on the cluster of {master}", served.name);
     run.go(source, &what, &served.info, &recipe).await
-}
-
-impl Run {
-    /// Returns a run that prints nothing at its end.
-    fn bare(request: RenderRequest, output: Output, quiet: bool) -> Run {
-        Run {
-            request,
-            stands: true,
-            output,
-            show: None,
-            patience: Arc::default(),
-            notes: Vec::new(),
-            stats: Lines::None,
-            trace: Lines::None,
-            record: None,
-            progress: Progress::new(quiet),
-            began: Instant::now(),
-            tell: false,
-        }
-    }
-
-    fn request(&mut self, info: &VolumeInfo) -> PathRequest {
-        let format = self.output.takes(self.request.magnify, self.request.background);
-        self.request.to_message(info, format, self.trace.wanted())
-    }
-
-    /// All that can be refused is; the folder is there.
-    fn ready(
-        &mut self,
-        info: &VolumeInfo,
-        orientation: Orientation,
-        anatomical: bool,
-    ) -> Result<RunProvenance, Fail> {
-        // From here on there may be files to clean up.
-        signals::listen();
-        self.request.fit(info, orientation, anatomical)?;
-        let as_what = (self.output.format, self.output.fps());
-        let recipe = RunProvenance::new(&self.request, info, orientation, as_what)?;
-        self.output.make()?;
-        self.notes.iter().for_each(|n| progress::note(n));
-        Ok(recipe)
-    }
-
-    /// Takes frames until the last one is on disk, Ctrl-C, or trouble.
-    async fn go(
-        self,
-        mut source: Source,
-        what: &str,
-        info: &VolumeInfo,
-        recipe: &RunProvenance,
-    ) -> Result<(), Fail> {
-        let Run {
-            request,
-            output,
-            show,
-            patience,
-            mut stats,
-            trace,
-            mut progress,
-            began,
-            tell,
-            ..
-        } = self;
-        let total = request.path.frames() as u64;
-        let [w, h] = request.size();
-        let s = if total == 1 { "" } else { "s" };
-        progress.frames(total, &format!("rendering {total} frame{s} of {w}x{h} of {what}"));
-        let output = Arc::new(output);
-        let mut writer = Writer::new(output.clone(), total, patience.clone())?;
-        let mut trace = Trace::new(trace);
-        let mut look = Look::default();
-        let (mut first, mut last) = (None, Instant::now());
-        let mut step = Step::default();
-        let ended: Result<(), Fail> = async {
-            loop {
-                tokio::select! {
-                    biased;
-                    code = signals::stopped() => return Err(Fail::silent(code)),
-                    written = writer.next_written() => { written?; }
-                    update = source.updates.recv(), if writer.has_room() => match update {
-                        Some(Ok(Update::Step(news))) => {
-                            // Frames that the master has done but that are not here yet count.
-                            step = Step { frames: news.frames.max(step.frames), ..news };
-                            progress.step(step.clone());
-                        }
-                        Some(Ok(Update::Frame { frame, stats: facts, stats_json, trace_json })) => {
-                            let begins = frame.number == 0;
-                            step.frames = step.frames.max(frame.number + 1);
-                            // People count frames of the whole path.
-                            let number = frame.number + request.path.first_frame() as u64;
-                            let frame = Frame { number, ..frame };
-                            last = Instant::now();
-                            first.get_or_insert(last);
-                            step = Step { frames: step.frames, ..Step::default() };
-                            let Some(facts) = facts else {
-                                progress.step(step.clone());
-                                writer.put(frame, None);
-                                continue;
-                            };
-                            look.at(&frame, &facts, info, &request);
-                            stats.put(&format!("{stats_json}\n"))?;
-                            trace.put(&trace_json)?;
-                            progress.step(step.clone());
-                            if show == Some(DebugView::Owner) {
-                                writer.put(debug_views::owner(&frame, &facts), None);
-                                continue;
-                            }
-                            let made = match output.format {
-                                Format::Apng if begins => Some(recipe.movie(&facts)),
-                                Format::Apng | Format::Y4m => None,
-                                Format::Png | Format::Png16 | Format::Exr => {
-                                    Some(recipe.frame(&facts))
-                                }
-                            };
-                            writer.put(frame, made);
-                        }
-                        Some(Ok(Update::Done)) => return Ok(()),
-                        Some(Err(e)) => return Err(e),
-                        None => return Err(Fail::failed("the job's updates ended early")),
-                    },
-                }
-            }
-        }
-        .await;
-        if ended.is_err() {
-            patience.give_up();
-            source.cancel.now().await;
-        }
-        // What is being encoded is whole in a moment: it is kept. Who reads a pipe may have
-        // stopped, though.
-        let patient = if ended.is_err() { LAST } else { Duration::MAX };
-        let drained = match tokio::time::timeout(patient, writer.end()).await {
-            Ok(drained) => drained,
-            Err(_) => Ok(()),
-        };
-        let ended = ended.and(drained);
-        progress.end();
-        let on_stdout = stats.on_stdout() || output.on_stdout();
-        let written = writer.written().to_vec();
-        if !written.is_empty() {
-            stats.keep()?;
-            trace.keep()?;
-        }
-        let kept = format!("{} of {total} frame{s} in {}", written.len(), output.shown(&written));
-        if let Err(fail) = ended {
-            if fail.line().is_none() {
-                let kept = if written.is_empty() {
-                    "nothing was kept".into()
-                } else {
-                    format!("kept {kept}")
-                };
-                progress::say_on_stderr(&format!("stopped: {kept}"));
-            } else if !written.is_empty() {
-                progress::note(&format!("kept {kept}"));
-            }
-            return Err(fail);
-        }
-        look.warn();
-        let mut line = format!(
-            "{total} frame{s} in {}, {}",
-            output.shown(&written),
-            progress::time(began.elapsed())
-        );
-        if let Some(first) = first
-            && total > 1
-        {
-            let each = (last - first).as_secs_f64() * 1e3 / (total - 1) as f64;
-            line += &format!(
-                ": the first after {}, then {each:.0} ms each",
-                progress::time(first - began)
-            );
-        }
-        if !tell {
-            // Whoever asked says it.
-        } else if on_stdout {
-            progress::say_on_stderr(&line);
-        } else {
-            say(&format!("{line}\n"))?;
-        }
-        look.verdict()
-    }
-}
-
-/// Frames' time lines, put into one file.
-struct Trace {
-    lines: Lines,
-    any: bool,
-}
-
-impl Trace {
-    fn new(lines: Lines) -> Self {
-        Trace { lines, any: false }
-    }
-
-    /// Adds a frame's events (a JSON array).
-    fn put(&mut self, array: &str) -> Result<(), Fail> {
-        let events = array.trim().trim_start_matches('[').trim_end_matches(']').trim();
-        if !self.lines.wanted() || events.is_empty() {
-            return Ok(());
-        }
-        let before =
-            if self.any { ",\n" } else { "{\"displayTimeUnit\":\"ms\",\"traceEvents\":[\n" };
-        self.any = true;
-        self.lines.put(before)?;
-        self.lines.put(events)
-    }
-
-    fn keep(mut self) -> Result<(), Fail> {
-        if self.lines.wanted() {
-            let begin = if self.any { "" } else { "{\"displayTimeUnit\":\"ms\",\"traceEvents\":[" };
-            self.lines.put(&format!("{begin}\n]}}\n"))?;
-        }
-        self.lines.keep()
-    }
-}
-
-/// Watches for blank frames, so that a note can give the reason.
-#[derive(Default)]
-struct Look {
-    blank: Vec<u64>,
-    why: Option<String>,
-    incomplete: Vec<u64>,
-    rehearsed: bool,
-}
-
-impl Look {
-    fn at(
-        &mut self,
-        frame: &Frame,
-        facts: &FrameStats,
-        info: &VolumeInfo,
-        request: &RenderRequest,
-    ) {
-        self.rehearsed |= facts.rehearsed;
-        if !facts.poisoned.is_empty() {
-            self.incomplete.push(frame.number);
-        }
-        let pixel = frame.format.bytes();
-        // Each pixel is the one before it.
-        let all_same = frame.bytes.len() < pixel
-            || frame.bytes[pixel..] == frame.bytes[..frame.bytes.len() - pixel];
-        let (lo, hi) = info.summary.range();
-        let tf = request.transfer.name();
-        let why = if facts.voxels.relevant == 0 && lo == hi {
-            format!("every value of the volume is {lo}, and `--tf {tf}` leaves that invisible")
-        } else if facts.voxels.relevant == 0 && request.path.crop.is_some() {
-            format!("no voxel in the cropping box is visible under `--tf {tf}`; widen --crop")
-        } else if facts.voxels.relevant == 0 {
-            format!(
-                "no voxel is visible under `--tf {tf}` (values go from {lo} to {hi}); try another \
-                 --tf, `slabcast info` shows what each would draw"
-            )
-        } else if !all_same {
-            return;
-        } else if facts.voxels.splatted == 0 {
-            "the volume lies outside the view, or between its pixels; check eye, target and height, or ask for a larger --size".into()
-        } else if request.background == slabcast_common::image::Background::Transparent
-            || frame.bytes[..pixel.div_ceil(4) * 3].iter().all(|&b| b == 0)
-        {
-            format!("what is in view is too faint to see; raise the opacities of `--tf {tf}`")
-        } else {
-            // Filled by one colour, or hidden by a background of its own colour: no mistake of
-            // ours to guess.
-            return;
-        };
-        self.blank.push(frame.number);
-        self.why.get_or_insert(why);
-    }
-
-    fn warn(&self) {
-        if self.rehearsed {
-            progress::warn(
-                "the master rehearses: nothing was drawn, and the pictures are stripes; render on a \
-                 master without --rehearse",
-            );
-        }
-        if let Some(why) = &self.why {
-            let which = match &self.blank[..] {
-                [one] => format!("frame {one} is"),
-                many => format!("{} frames are", many.len()),
-            };
-            progress::warn(&format!("{which} blank: {why}"));
-        }
-    }
-
-    fn verdict(&self) -> Result<(), Fail> {
-        match &self.incomplete[..] {
-            [] => Ok(()),
-            some => Err(Fail::failed(format!(
-                "frame {} has tiles that were given up after three workers were lost with them \
-                 (--stats lists them as `poisoned`); see the workers' logs, then render again with \
-                 --force",
-                some.iter().map(u64::to_string).collect::<Vec<_>>().join(", ")
-            ))),
-        }
-    }
 }

@@ -1,0 +1,93 @@
+//! Looks at each frame for what a person should hear of: blank pictures, missing tiles, rehearsals.
+
+use slabcast_common::stats::FrameStats;
+use slabcast_common::volume::VolumeInfo;
+use slabcast_session::fail::Fail;
+use slabcast_session::output::Frame;
+use slabcast_session::progress;
+use slabcast_session::request::RenderRequest;
+
+/// Watches for blank frames, so that a note can give the reason.
+#[derive(Default)]
+pub(super) struct FrameCheck {
+    blank: Vec<u64>,
+    why: Option<String>,
+    incomplete: Vec<u64>,
+    rehearsed: bool,
+}
+
+impl FrameCheck {
+    /// Looks at one frame and its statistics.
+    pub(super) fn look(
+        &mut self,
+        frame: &Frame,
+        stats: &FrameStats,
+        info: &VolumeInfo,
+        request: &RenderRequest,
+    ) {
+        self.rehearsed |= stats.rehearsed;
+        if !stats.poisoned.is_empty() {
+            self.incomplete.push(frame.number);
+        }
+        let pixel = frame.format.bytes();
+        // Each pixel is the one before it.
+        let all_same = frame.bytes.len() < pixel
+            || frame.bytes[pixel..] == frame.bytes[..frame.bytes.len() - pixel];
+        let (lo, hi) = info.summary.range();
+        let tf = request.transfer.name();
+        let why = if stats.voxels.relevant == 0 && lo == hi {
+            format!("every value of the volume is {lo}, and `--tf {tf}` leaves that invisible")
+        } else if stats.voxels.relevant == 0 && request.path.crop.is_some() {
+            format!("no voxel in the cropping box is visible under `--tf {tf}`; widen --crop")
+        } else if stats.voxels.relevant == 0 {
+            format!(
+                "no voxel is visible under `--tf {tf}` (values go from {lo} to {hi}); try another \
+                 --tf, `slabcast info` shows what each would draw"
+            )
+        } else if !all_same {
+            return;
+        } else if stats.voxels.splatted == 0 {
+            "the volume lies outside the view, or between its pixels; check eye, target and height, or ask for a larger --size".into()
+        } else if request.background == slabcast_common::image::Background::Transparent
+            || frame.bytes[..pixel.div_ceil(4) * 3].iter().all(|&b| b == 0)
+        {
+            format!("what is in view is too faint to see; raise the opacities of `--tf {tf}`")
+        } else {
+            // Filled by one colour, or hidden by a background of its own colour: no mistake of
+            // ours to guess.
+            return;
+        };
+        self.blank.push(frame.number);
+        self.why.get_or_insert(why);
+    }
+
+    /// Warns of blank and rehearsed frames.
+    pub(super) fn warn(&self) {
+        if self.rehearsed {
+            progress::warn(
+                "the master rehearses: nothing was drawn, and the pictures are stripes; render on a \
+                 master without --rehearse",
+            );
+        }
+        if let Some(why) = &self.why {
+            let which = match &self.blank[..] {
+                [one] => format!("frame {one} is"),
+                many => format!("{} frames are", many.len()),
+            };
+            progress::warn(&format!("{which} blank: {why}"));
+        }
+    }
+
+    /// Returns a failure if frames lack tiles.
+    pub(super) fn verdict(&self) -> Result<(), Fail> {
+        match &self.incomplete[..] {
+            [] => Ok(()),
+            some => Err(Fail::failed(format!(
+                "frame {} has tiles that were given up after three workers were lost with them \
+                 (--stats lists them as `poisoned`); see the workers' logs, then render again with \
+                 --force",
+                some.iter().map(u64::to_string).collect::<Vec<_>>().join(", ")
+            ))),
+        }
+    }
+}

@@ -1,0 +1,222 @@
+//! One run: takes updates from whoever renders, writes frames, and says how it ended.
+
+use super::debug_views::{self, DebugView};
+use super::frame_check::FrameCheck;
+use super::trace::TraceFile;
+use slabcast_common::volume::VolumeInfo;
+use slabcast_scene::path::Orientation;
+use slabcast_scene::request::PathRequest;
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::output::provenance::RunProvenance;
+use slabcast_session::output::{DiskWait, Format, Frame, Lines, Output, Writer};
+use slabcast_session::progress::{self, Progress, Step};
+use slabcast_session::request::RenderRequest;
+use slabcast_session::signals;
+use slabcast_session::source::{Source, Update};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// Time for frames that are being written once the run has failed or was stopped: ten times what
+/// the largest picture takes on a slow disk.
+const LAST: Duration = Duration::from_secs(20);
+
+/// State of one run, whoever renders its frames.
+pub(super) struct Run {
+    pub(super) request: RenderRequest,
+    /// Whether the up axis was given or needs no note.
+    pub(super) stands: bool,
+    pub(super) output: Output,
+    pub(super) show: Option<DebugView>,
+    pub(super) patience: Arc<DiskWait>,
+    /// Notes for stderr once the request has been accepted.
+    pub(super) notes: Vec<String>,
+    pub(super) stats: Lines,
+    pub(super) trace: Lines,
+    pub(super) record: Option<PathBuf>,
+    pub(super) progress: Progress,
+    pub(super) began: Instant,
+    /// Whether the run ends with a line that names the pictures.
+    pub(super) tell: bool,
+}
+
+impl Run {
+    /// Returns a run that prints nothing at its end.
+    pub(super) fn bare(request: RenderRequest, output: Output, quiet: bool) -> Run {
+        Run {
+            request,
+            stands: true,
+            output,
+            show: None,
+            patience: Arc::default(),
+            notes: Vec::new(),
+            stats: Lines::None,
+            trace: Lines::None,
+            record: None,
+            progress: Progress::new(quiet),
+            began: Instant::now(),
+            tell: false,
+        }
+    }
+
+    pub(super) fn request(&mut self, info: &VolumeInfo) -> PathRequest {
+        let format = self.output.takes(self.request.magnify, self.request.background);
+        self.request.to_message(info, format, self.trace.wanted())
+    }
+
+    /// All that can be refused is; the folder is there.
+    pub(super) fn ready(
+        &mut self,
+        info: &VolumeInfo,
+        orientation: Orientation,
+        anatomical: bool,
+    ) -> Result<RunProvenance, Fail> {
+        // From here on there may be files to clean up.
+        signals::listen();
+        self.request.fit(info, orientation, anatomical)?;
+        let as_what = (self.output.format, self.output.fps());
+        let recipe = RunProvenance::new(&self.request, info, orientation, as_what)?;
+        self.output.make()?;
+        self.notes.iter().for_each(|n| progress::note(n));
+        Ok(recipe)
+    }
+
+    /// Takes frames until the last one is on disk, Ctrl-C, or trouble.
+    pub(super) async fn go(
+        self,
+        mut source: Source,
+        what: &str,
+        info: &VolumeInfo,
+        recipe: &RunProvenance,
+    ) -> Result<(), Fail> {
+        let Run {
+            request,
+            output,
+            show,
+            patience,
+            mut stats,
+            trace,
+            mut progress,
+            began,
+            tell,
+            ..
+        } = self;
+        let total = request.path.frames() as u64;
+        let [w, h] = request.size();
+        let s = if total == 1 { "" } else { "s" };
+        progress.frames(total, &format!("rendering {total} frame{s} of {w}x{h} of {what}"));
+        let output = Arc::new(output);
+        let mut writer = Writer::new(output.clone(), total, patience.clone())?;
+        let mut trace = TraceFile::new(trace);
+        let mut check = FrameCheck::default();
+        let (mut first, mut last) = (None, Instant::now());
+        let mut step = Step::default();
+        let ended: Result<(), Fail> = async {
+            loop {
+                tokio::select! {
+                    biased;
+                    code = signals::stopped() => return Err(Fail::silent(code)),
+                    written = writer.next_written() => { written?; }
+                    update = source.updates.recv(), if writer.has_room() => match update {
+                        Some(Ok(Update::Step(news))) => {
+                            // Frames that the master has done but that are not here yet count.
+                            step = Step { frames: news.frames.max(step.frames), ..news };
+                            progress.step(step.clone());
+                        }
+                        Some(Ok(Update::Frame { frame, stats: facts, stats_json, trace_json })) => {
+                            let begins = frame.number == 0;
+                            step.frames = step.frames.max(frame.number + 1);
+                            // People count frames of the whole path.
+                            let number = frame.number + request.path.first_frame() as u64;
+                            let frame = Frame { number, ..frame };
+                            last = Instant::now();
+                            first.get_or_insert(last);
+                            step = Step { frames: step.frames, ..Step::default() };
+                            let Some(facts) = facts else {
+                                progress.step(step.clone());
+                                writer.put(frame, None);
+                                continue;
+                            };
+                            check.look(&frame, &facts, info, &request);
+                            stats.put(&format!("{stats_json}\n"))?;
+                            trace.put(&trace_json)?;
+                            progress.step(step.clone());
+                            if show == Some(DebugView::Owner) {
+                                writer.put(debug_views::owner(&frame, &facts), None);
+                                continue;
+                            }
+                            let made = match output.format {
+                                Format::Apng if begins => Some(recipe.movie(&facts)),
+                                Format::Apng | Format::Y4m => None,
+                                Format::Png | Format::Png16 | Format::Exr => {
+                                    Some(recipe.frame(&facts))
+                                }
+                            };
+                            writer.put(frame, made);
+                        }
+                        Some(Ok(Update::Done)) => return Ok(()),
+                        Some(Err(e)) => return Err(e),
+                        None => return Err(Fail::failed("the job's updates ended early")),
+                    },
+                }
+            }
+        }
+        .await;
+        if ended.is_err() {
+            patience.give_up();
+            source.cancel.now().await;
+        }
+        // What is being encoded is whole in a moment: it is kept. Who reads a pipe may have
+        // stopped, though.
+        let patient = if ended.is_err() { LAST } else { Duration::MAX };
+        let drained = match tokio::time::timeout(patient, writer.end()).await {
+            Ok(drained) => drained,
+            Err(_) => Ok(()),
+        };
+        let ended = ended.and(drained);
+        progress.end();
+        let on_stdout = stats.on_stdout() || output.on_stdout();
+        let written = writer.written().to_vec();
+        if !written.is_empty() {
+            stats.keep()?;
+            trace.keep()?;
+        }
+        let kept = format!("{} of {total} frame{s} in {}", written.len(), output.shown(&written));
+        if let Err(fail) = ended {
+            if fail.line().is_none() {
+                let kept = if written.is_empty() {
+                    "nothing was kept".into()
+                } else {
+                    format!("kept {kept}")
+                };
+                progress::say_on_stderr(&format!("stopped: {kept}"));
+            } else if !written.is_empty() {
+                progress::note(&format!("kept {kept}"));
+            }
+            return Err(fail);
+        }
+        check.warn();
+        let mut line = format!(
+            "{total} frame{s} in {}, {}",
+            output.shown(&written),
+            progress::time(began.elapsed())
+        );
+        if let Some(first) = first
+            && total > 1
+        {
+            let each = (last - first).as_secs_f64() * 1e3 / (total - 1) as f64;
+            line += &format!(
+                ": the first after {}, then {each:.0} ms each",
+                progress::time(first - began)
+            );
+        }
+        if !tell {
+            // Whoever asked says it.
+        } else if on_stdout {
+            progress::say_on_stderr(&line);
+        } else {
+            say(&format!("{line}\n"))?;
+        }
+        check.verdict()
+    }
+}

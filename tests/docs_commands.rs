@@ -273,6 +273,10 @@ impl Scratch {
         let at = |e: String| format!("{}:{}: {e}", shown.document, shown.line);
         match words.first().map(String::as_str) {
             Some("master") => return self.start_master(&words).map_err(at),
+            // The model's own errors are judged at 512 pixels unless the line says otherwise.
+            Some("lab") if words[1] == "error" && !words.contains(&"--model-pixels".into()) => {
+                words.extend(["--model-pixels".into(), "16".into()]);
+            }
             Some("status" | "jobs") if !words.contains(&"--master".into()) => {
                 words.extend(["--master".into(), SHOWN_MASTERS[0].into()]);
             }

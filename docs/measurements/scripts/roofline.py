@@ -1,7 +1,9 @@
 #!/usr/bin/env python3
 """Where a frame's time goes, in nanoseconds and cycles a unit of work, and how near adding is to the roof.
 
-    python3 docs/measurements/scripts/roofline.py --slabcast target/release/slabcast -- VOLUME --tf NAME [flags of bench]
+    python3 docs/measurements/scripts/roofline.py --slabcast target/profiling/slabcast -- VOLUME --tf NAME [flags of bench]
+
+(`cargo build --profile profiling` keeps the line numbers that it needs.)
 
 Runs `slabcast lab bench` on one thread under `perf record` (by the clock: virtual machines count no cycles), asks
 llvm-addr2line which functions each sample was in, those inlined included, and adds them up by stage. Units

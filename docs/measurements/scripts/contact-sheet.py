@@ -2,11 +2,11 @@
 r"""Puts PNGs side by side into one: docs/measurements/scripts/contact-sheet.py OUT.png COLUMNS IN.png...
 
 8 bits, RGB or RGBA over black, all of one size. Python's standard library is all it needs.
-docs/pictures/first-light.png was made by
+For example eight views of the sample, in two rows:
 
     slabcast render samples/mni152_t1.nii.gz --tf brain --size 290x240 --height 205 \
-        --elevation 8 --frames 8 --start 20 --step 45 -o /tmp/f
-    python3 docs/measurements/scripts/contact-sheet.py docs/pictures/first-light.png 4 /tmp/f/frame_*.png
+        --elevation 8 --frames 8 --start 20 --step 45 -o turn
+    python3 docs/measurements/scripts/contact-sheet.py turn.png 4 turn/frame_*.png
 """
 
 import struct

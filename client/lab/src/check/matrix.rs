@@ -22,6 +22,9 @@ const SLABS: [u32; 3] = [1, 3, 5];
 const THREADS: [u32; 2] = [1, 2];
 const CULL: [bool; 2] = [true, false];
 const LINKS: [Link; 3] = [Link::Embedded, Link::Tcp, Link::TcpShort];
+/// Indices of workers, threads and links among the levels of [`Setting::all`]: a cluster is started
+/// for each combination of them.
+const CLUSTER: [usize; 3] = [0, 3, 5];
 const SCHEDULES: [Schedule; 2] = [Schedule::Slab, Schedule::Region];
 
 /// Compares pixels over workers (1, 2, 3, 5), tiles (16 to 256, auto), slabs (1, 3, 5) or regions,
@@ -67,7 +70,8 @@ impl Setting {
             LINKS.len(),
             SCHEDULES.len(),
         ];
-        let rows = if pairwise { pairwise::rows(&levels) } else { pairwise::product(&levels) };
+        let rows =
+            if pairwise { pairwise::rows(&levels, &CLUSTER) } else { pairwise::product(&levels) };
         let mut settings: Vec<Setting> = rows
             .iter()
             .map(|r| {

@@ -92,7 +92,12 @@ impl CutContext<'_> {
 
     /// Returns the edge in pixels for which the frame is predicted to end first.
     fn choose_edge(&self, through: &Through) -> u32 {
-        let largest = if self.is_local { u32::MAX } else { MAX_REMOTE_TILE_PX };
+        let largest = match self.is_local {
+            true => u32::MAX,
+            // What the first frame is cut into the next ones go on with, and nothing is known yet.
+            false if self.threads > 1 && self.history.is_empty() => WHOLE_PX,
+            false => MAX_REMOTE_TILE_PX,
+        };
         // Sole frames split single tiles instead.
         let finest = if self.sole && !self.bricks_bind { WHOLE_PX } else { EDGES_PX[0] };
         let least_tiles =

@@ -290,8 +290,8 @@ impl Axis {
 ///
 /// By what is said at `Change`; sheets hold light as a field does that is constant in each. Where
 /// colours have a slope, their sums and those of the sheets beside have a part in it: a share s of
-/// all sums moves c and its neighbours by 2 s and the weights by 4 s, so the slope by at most (5 G
-/// + 6 H) s, and light by |phi| / a of that, at most half and at most a twelfth of a sheet's
+/// all sums moves c and its neighbours by 2 s and the weights by 4 s, so the slope by at most
+/// `(5 G + 6 H) s`, and light by |phi| / a of that, at most half and at most a twelfth of a sheet's
 /// optical depth; what is beyond that share counts 17 times, once, as in [`quantisation`].
 pub fn rounding(
     scene: &SceneSpec,

@@ -65,7 +65,7 @@ impl Fail {
     }
 
     /// Returns the failure with `more` at the end of its line.
-    pub fn add(self, more: &str) -> Self {
+    pub fn with_note(self, more: &str) -> Self {
         Fail { line: self.line.map(|l| l + more), ..self }
     }
 

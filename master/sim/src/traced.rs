@@ -200,7 +200,7 @@ impl TileModel for TracedTiles<'_> {
             };
             (facts, progress.ok_or_else(unknown)?, region.touched)
         };
-        let (bricks, view) = (job.bricks.clone(), job.view.clone());
+        let (bricks, view) = (job.bricks.clone(), job.view);
         Ok((facts, TracedRegion { progress, bricks, view, touched }))
     }
 

@@ -105,7 +105,7 @@ pub(crate) fn blame(fail: Fail) -> Fail {
     let given = GIVEN.get().into_iter().flatten().find(|g| flag == Some(g.key.as_str()));
     match given {
         Some(g) => {
-            let fail = fail.add(&format!("; it comes from {}", g.named()));
+            let fail = fail.with_note(&format!("; it comes from {}", g.named()));
             if matches!(g.source, Source::File(_)) { fail.of_a_file() } else { fail }
         }
         None => fail,

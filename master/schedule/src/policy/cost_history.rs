@@ -78,7 +78,9 @@ impl WorkerRates {
         let (a, b) = (self.slowness(one), self.slowness(other));
         let surprise = (one_us / other_us) / (a / b);
         let surprise = surprise.clamp(1.0 / RATE_STEP_LIMIT, RATE_STEP_LIMIT);
-        let step = surprise.powf(NEW_VALUE_WEIGHT);
+        // The fourth root: `NEW_VALUE_WEIGHT` as an exponent.
+        const { assert!(NEW_VALUE_WEIGHT == 0.25) };
+        let step = surprise.sqrt().sqrt();
         let limit = |x: f64| x.clamp(1.0 / RATE_LIMIT, RATE_LIMIT);
         self.slowness.insert(one, limit(a * step));
         self.slowness.insert(other, limit(b / step));

@@ -711,7 +711,6 @@ impl Frame {
             relevant: core.job.bricks.len() as u64,
             needed: core.brick_use.bricks,
             needed_voxels: core.brick_use.voxels,
-            ..BrickStats::default()
         };
         let quality = core.job.scene.quality;
         let relevant = core.relevant_voxels;

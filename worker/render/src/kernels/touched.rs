@@ -35,6 +35,7 @@ pub struct Some16<'a> {
     n: usize,
 }
 
+#[expect(clippy::len_without_is_empty, reason = "callers only loop over it")]
 impl<'a> Some16<'a> {
     /// All of them.
     #[inline(always)]
@@ -49,6 +50,7 @@ impl<'a> Some16<'a> {
     }
 }
 
+#[expect(clippy::len_without_is_empty, reason = "callers only loop over it")]
 impl Places {
     /// Those of the bits in `rows`.
     #[inline(always)]

@@ -60,6 +60,7 @@ impl<T> Default for AppendList<T> {
     }
 }
 
+#[expect(clippy::len_without_is_empty, reason = "callers only index it")]
 impl<T> AppendList<T> {
     pub fn len(&self) -> usize {
         self.len.get()

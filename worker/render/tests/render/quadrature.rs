@@ -2,7 +2,7 @@ use slabcast_render::judge::reference::quadrature::*;
 
 #[test]
 fn four_gauss_nodes_integrate_degree_seven_exactly() {
-    let g = Gauss::new();
+    let g = Gauss::four_nodes();
     for power in 0..8 {
         let got: f64 = (0..4).map(|i| g.weights[i] * g.nodes[i].powi(power)).sum();
         assert!((got - 1.0 / f64::from(power + 1)).abs() < 1e-15, "power {power}: {got}");

@@ -143,7 +143,7 @@ impl Reference {
             offsets: (0..512)
                 .map(|i| m * DVec3::from_array(local_position(i).map(f64::from)))
                 .collect(),
-            rule: Gauss::new(),
+            rule: Gauss::four_nodes(),
             tolerance: TOLERANCE,
             level: false,
         }

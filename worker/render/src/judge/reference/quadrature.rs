@@ -135,7 +135,7 @@ pub struct Gauss {
 }
 
 impl Gauss {
-    pub fn new() -> Gauss {
+    pub fn four_nodes() -> Gauss {
         let inner = (3.0 / 7.0 - 2.0 / 7.0 * 1.2f64.sqrt()).sqrt();
         let outer = (3.0 / 7.0 + 2.0 / 7.0 * 1.2f64.sqrt()).sqrt();
         let nodes = [-outer, -inner, inner, outer].map(|x| (x + 1.0) * 0.5);

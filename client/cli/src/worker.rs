@@ -51,7 +51,7 @@ pub(crate) struct WorkerArgs {
 /// Runs `slabcast worker`.
 pub(crate) fn run(args: &WorkerArgs) -> Result<(), Fail> {
     let rehearsal = match &args.rehearse {
-        Some(file) => Some(Arc::new(Rehearsal::new(plan::read(file)?))),
+        Some(file) => Some(Arc::new(Rehearsal::new(plan::read_trace(file)?))),
         None => None,
     };
     let config = Config {

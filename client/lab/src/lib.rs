@@ -1,14 +1,20 @@
 //! The laboratory: how far pictures are from the truth, what they cost, and what a cluster would do.
 //!
-//! - [`error`] measures one picture against the limit, [`explain`] tells why a pixel is as it is,
-//!   [`check`] compares pictures with the oracle over every way to make them.
-//! - [`bench`] times one scene, [`report`] sweeps quality for error against time, and [`autotune`]
-//!   chooses the quality for `--error` and `--budget`.
-//! - [`plan`] predicts clusters that are not there, [`study`] repeats the paper's evaluation,
-//!   [`replay`] makes a recorded scheduler's decisions again.
+//! One module per subcommand of `slabcast lab`; each has its arguments and a `run` function:
 //!
-//! It sees all other crates but the command. Nothing that renders pictures for a user depends on
-//! it, except that `render --error` and `--budget` ask [`autotune`].
+//! - [`error`] measures the error of one picture against the limit of thin sheets.
+//! - [`explain`] shows how the samples along one pixel's ray add up to its colour.
+//! - [`check`] compares pictures with the oracle over every way to render them.
+//! - [`bench`] times the renderer on one scene.
+//! - [`report`] sweeps the quality settings and reports error against time.
+//! - [`plan`] predicts the frame times of a cluster that does not exist yet.
+//! - [`study`] repeats the evaluation of the paper.
+//! - [`replay`] repeats the decisions of a recorded scheduler and compares them.
+//!
+//! [`autotune`] chooses the quality for `render --error` and `--budget`.
+//!
+//! The crate may use every crate except the command. Of what renders pictures for a user, only
+//! `render --error` and `--budget` depend on it.
 
 mod ablation;
 pub mod autotune;

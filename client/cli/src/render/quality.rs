@@ -35,9 +35,10 @@ pub(super) fn choose_here(
     let cluster =
         runtime.block_on(async { Cluster::start(volume.clone(), orientation, crew, None) })?;
     let (handle, request) = (cluster.handle(), run.request.clone());
-    let wire = Connection::Embedded(&handle);
-    let through = ClusterRun { runtime, wire, info, request, crew: crew.to_string() };
-    match choose(&mut LocalBed::new(trial, Clock::Cluster(Box::new(through))), &target, quiet) {
+    let connection = Connection::Embedded(&handle);
+    let cluster_run =
+        ClusterRun { runtime, connection, info, request, description: crew.to_string() };
+    match choose(&mut LocalBed::new(trial, Clock::Cluster(Box::new(cluster_run))), &target, quiet) {
         // A record begins with the first worker.
         Ok(chosen) if run.record.is_none() => {
             chosen.settle(&mut run.request);
@@ -63,8 +64,9 @@ pub(super) fn choose_there(
     let info = served.info.clone();
     run.request.fit(&info, served.orientation, served.anatomical)?;
     let (target, request) = (run.request.target, run.request.clone());
-    let crew = format!("the cluster of {master}");
-    let through = ClusterRun { runtime, wire: Connection::Remote(client), info, request, crew };
-    choose(&mut ClusterBed::new(through), &target, quiet)?.settle(&mut run.request);
+    let description = format!("the cluster of {master}");
+    let cluster_run =
+        ClusterRun { runtime, connection: Connection::Remote(client), info, request, description };
+    choose(&mut ClusterBed::new(cluster_run), &target, quiet)?.settle(&mut run.request);
     Ok(())
 }

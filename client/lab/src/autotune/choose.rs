@@ -1,17 +1,17 @@
-//! Settings that keep a word: an error that is not passed, a time that is not overrun.
+//! Chooses the setting that meets a target: a largest error, a longest frame time, or both.
 //!
-//! A ladder of settings is climbed from fast to near. For an error: until some rungs keep it, and
-//! the fastest of these is taken; for a time: until some rungs overrun it, and the nearest of those
-//! before is taken. Rungs are measured when they are needed, and [`super::cache`] remembers them.
+//! A ladder of settings is climbed from fast to exact. For a largest error, until some rungs meet
+//! it; the fastest of these is taken. For a longest time, until some rungs exceed it; the most
+//! exact of those before is taken. Rungs are measured when needed, and `cache` keeps the results.
 //!
-//! The word is kept with room to spare: views between those that are judged, and pixels between
-//! those that are looked at, may be worse. How often it holds is in docs/accuracy.md.
+//! Targets are met with a margin, since the views and pixels between the judged ones may be worse.
+//! docs/accuracy.md says how often a target holds.
 
 use super::cache::MeasurementCache;
 use super::cluster_bed::all_around;
 use super::local_bed::{Clock, LocalBed};
 use super::setting::{Setting, fraction};
-use super::test_bed::{TestBed, stopped};
+use super::test_bed::{TestBed, check_not_stopped};
 use super::trial::{Deviation, Trial};
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::volume::{Volume, VolumeInfo};
@@ -24,44 +24,46 @@ use slabcast_session::request::RenderRequest;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// What is measured is so much below what is promised, at least.
-const ROOM_RMSE: f64 = 1.2;
-/// The same of the error that 99.9 % of the pixels keep: of 3072 pixels a third is not blank, and
-/// the second worst of those is all that tells.
-const ROOM_MOST: f64 = 1.5;
-/// The same of time: a few frames stand for all, and one run of a machine is not like the next.
-const ROOM_TIME: f64 = 1.1;
-/// Rungs beyond the first that keeps an error, of which one may be faster.
-const BEYOND: usize = 3;
+/// Least ratio of the promised RMSE to the measured one.
+const RMSE_MARGIN: f64 = 1.2;
+/// Least ratio of the promised error of 99.9 % of the pixels to the measured one. Of 3072 pixels
+/// about a third are not blank, so the second worst of these decides.
+const MAX_ERROR_MARGIN: f64 = 1.5;
+/// Least ratio of the budget to the measured frame time. A few frames stand for all, and the runs of
+/// one machine differ.
+const TIME_MARGIN: f64 = 1.1;
+/// Rungs tried beyond the first that meets (or misses) the target; one of them may be better.
+const EXTRA_RUNGS: usize = 3;
 
-/// Returns whether a measured error keeps the target's bounds with room to spare.
-fn keeps_error(target: &QualityTarget, off: &Deviation) -> bool {
+/// Returns whether a measured error keeps the target's bounds with the margin.
+fn keeps_error(target: &QualityTarget, deviation: &Deviation) -> bool {
     let under =
-        |bound: Option<f64>, got: f64, room: f64| bound.is_none_or(|b| got * room <= b * 255.0);
-    under(target.error, off.rmse, ROOM_RMSE) && under(target.error_max, off.most_999, ROOM_MOST)
+        |bound: Option<f64>, got: f64, margin: f64| bound.is_none_or(|b| got * margin <= b * 255.0);
+    under(target.error, deviation.rmse, RMSE_MARGIN)
+        && under(target.error_max, deviation.most_999, MAX_ERROR_MARGIN)
 }
 
-/// Returns whether a frame time in ms keeps the target's budget with room to spare.
+/// Returns whether a frame time in ms keeps the target's budget with the margin.
 fn keeps_time(target: &QualityTarget, ms: f64) -> bool {
-    target.budget.is_none_or(|b| ms * ROOM_TIME <= b)
+    target.budget.is_none_or(|b| ms * TIME_MARGIN <= b)
 }
 
-/// What was chosen, and by what.
+/// The setting that was chosen for a target, with its measured error and time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Chosen {
     /// Setting that was chosen.
-    pub setting: Setting,
-    /// Its measured error.
-    pub off: Deviation,
-    /// Median of a frame.
-    pub ms: f64,
+    pub(crate) setting: Setting,
+    /// Measured error of the setting.
+    pub(crate) deviation: Deviation,
+    /// Median time of a frame, in ms.
+    pub(crate) ms: f64,
 }
 
-/// The rungs, each as fast as the ones before or nearer to the limit.
+/// Returns the settings to try for pictures of `size` pixels, from fast to exact.
 ///
-/// From the fronts of `slabcast lab report` (docs/accuracy.md): 16-bit sums with eps falling as sheets
-/// become thin, then 32 bits where those round too much. 16 bits are tried only where they have room
-/// for a sheet.
+/// Taken from the Pareto fronts of `slabcast lab report` (docs/accuracy.md): 16-bit sums with eps
+/// falling as sheets become thin, then 32-bit sums where 16 bits round too much. 16 bits are tried
+/// only where a sheet fits them.
 pub(super) fn ladder(base: &Setting, size: [u32; 2]) -> Vec<Setting> {
     let b = base.quality;
     let short = b.fits_i16();
@@ -95,43 +97,43 @@ pub(super) fn ladder(base: &Setting, size: [u32; 2]) -> Vec<Setting> {
     all
 }
 
-/// Measures what is not known yet.
+/// Climbs the ladder and measures what the cache lacks.
 struct Climb<'a> {
-    place: &'a mut dyn TestBed,
-    kept: &'a mut MeasurementCache,
-    /// Times of a place that does not keep them.
+    bed: &'a mut dyn TestBed,
+    cache: &'a mut MeasurementCache,
+    /// Frame times in ms on a test bed whose times are not kept.
     times: Vec<(Setting, f64)>,
     progress: Progress,
     measured: usize,
 }
 
 impl Climb<'_> {
-    fn off(&mut self, setting: &Setting) -> Result<Deviation, Fail> {
-        if let Some(off) = self.kept.off(setting) {
-            return Ok(off);
+    fn deviation(&mut self, setting: &Setting) -> Result<Deviation, Fail> {
+        if let Some(deviation) = self.cache.deviation(setting) {
+            return Ok(deviation);
         }
-        stopped()?;
-        let off = self.place.off(setting, &mut self.progress)?;
+        check_not_stopped()?;
+        let deviation = self.bed.deviation(setting, &mut self.progress)?;
         self.measured += 1;
-        self.kept.put_off(setting, off);
-        Ok(off)
+        self.cache.put_deviation(setting, deviation);
+        Ok(deviation)
     }
 
     fn ms(&mut self, setting: &Setting) -> Result<f64, Fail> {
-        let keeps = self.place.keeps_times();
+        let keeps = self.bed.keeps_times();
         let known = if keeps {
-            self.kept.ms(setting)
+            self.cache.ms(setting)
         } else {
             self.times.iter().find(|(s, _)| s == setting).map(|(_, ms)| *ms)
         };
         if let Some(ms) = known {
             return Ok(ms);
         }
-        stopped()?;
-        let ms = self.place.ms(setting)?;
+        check_not_stopped()?;
+        let ms = self.bed.ms(setting)?;
         self.measured += 1;
         if keeps {
-            self.kept.put_ms(setting, ms);
+            self.cache.put_ms(setting, ms);
         } else {
             self.times.push((*setting, ms));
         }
@@ -139,37 +141,37 @@ impl Climb<'_> {
     }
 
     fn chosen(&mut self, setting: Setting) -> Result<Chosen, Fail> {
-        let (off, ms) = (self.off(&setting)?, self.ms(&setting)?);
-        Ok(Chosen { setting, off, ms })
+        let (deviation, ms) = (self.deviation(&setting)?, self.ms(&setting)?);
+        Ok(Chosen { setting, deviation, ms })
     }
 
-    /// The fastest of those that keep an error.
+    /// Returns the fastest rung that keeps the target's error.
     fn by_error(&mut self, target: &QualityTarget, rungs: &[Setting]) -> Result<Chosen, Fail> {
         let (mut best, mut beyond): (Option<Chosen>, usize) = (None, 0);
         let mut nearest: Option<(f64, f64)> = None;
         for setting in rungs {
-            let off = self.off(setting)?;
-            let least = nearest.get_or_insert((off.rmse, off.most_999));
-            *least = (least.0.min(off.rmse), least.1.min(off.most_999));
-            if keeps_error(target, &off) {
+            let deviation = self.deviation(setting)?;
+            let least = nearest.get_or_insert((deviation.rmse, deviation.most_999));
+            *least = (least.0.min(deviation.rmse), least.1.min(deviation.most_999));
+            if keeps_error(target, &deviation) {
                 let chosen = self.chosen(*setting)?;
                 if best.is_none_or(|b| chosen.ms < b.ms) {
                     best = Some(chosen);
                 }
             }
             beyond += usize::from(best.is_some());
-            if beyond > BEYOND {
+            if beyond > EXTRA_RUNGS {
                 break;
             }
         }
         let Some(best) = best else {
             let (rmse, most) = nearest.unwrap_or_default();
             let (flag, least) = match (target.error, target.error_max) {
-                (Some(e), _) if rmse * ROOM_RMSE > e * 255.0 => ("error", rmse * ROOM_RMSE),
-                _ => ("error-max", most * ROOM_MOST),
+                (Some(e), _) if rmse * RMSE_MARGIN > e * 255.0 => ("error", rmse * RMSE_MARGIN),
+                _ => ("error-max", most * MAX_ERROR_MARGIN),
             };
             return Err(Fail::usage(format!(
-                "--{flag}: no setting comes so near in this scene; the nearest may promise \
+                "--{flag}: no setting is so exact in this scene; the best one can promise \
                  {:.3}/255: give {:.5} or more",
                 least,
                 least / 255.0 * 1.005
@@ -181,14 +183,14 @@ impl Climb<'_> {
                  more, a larger error or a smaller --size",
                 QualityTarget { budget: None, ..*target }.flags(),
                 best.ms,
-                best.setting.name(&self.place.base()),
-                (best.ms * ROOM_TIME).ceil()
+                best.setting.name(&self.bed.base()),
+                (best.ms * TIME_MARGIN).ceil()
             )));
         }
         Ok(best)
     }
 
-    /// The nearest of those that keep a time.
+    /// Returns the most exact rung that keeps the budget.
     fn by_time(&mut self, target: &QualityTarget, rungs: &[Setting]) -> Result<Chosen, Fail> {
         let (mut within, mut over) = (Vec::new(), 0);
         let mut fastest = f64::INFINITY;
@@ -201,17 +203,17 @@ impl Climb<'_> {
             } else {
                 over += 1;
             }
-            // Rungs come in the order of their usual cost, and this scene may be unusual.
-            if over > BEYOND {
+            // Rungs are in the order of their usual cost, which may not be that of this scene.
+            if over > EXTRA_RUNGS {
                 break;
             }
         }
-        // Finer ones are nearer, but for those whose eps or sums stand out.
-        let last = within.len().saturating_sub(BEYOND + 1);
+        // Finer rungs are more exact, except where eps or the sums limit them.
+        let last = within.len().saturating_sub(EXTRA_RUNGS + 1);
         let mut best: Option<Chosen> = None;
         for setting in within.split_off(last) {
             let chosen = self.chosen(setting)?;
-            if best.is_none_or(|b| chosen.off.rmse < b.off.rmse) {
+            if best.is_none_or(|b| chosen.deviation.rmse < b.deviation.rmse) {
                 best = Some(chosen);
             }
         }
@@ -219,45 +221,42 @@ impl Climb<'_> {
             Fail::usage(format!(
                 "--budget: the fastest setting of this scene takes {fastest:.1} ms on {}; give {:.0}ms \
                  or more, a smaller --size or more threads",
-                self.place.crew(),
-                (fastest * ROOM_TIME).ceil()
+                self.bed.description(),
+                (fastest * TIME_MARGIN).ceil()
             ))
         })
     }
 }
 
-/// Chooses the settings of a scene by what they should come to, and says so.
+/// Chooses the setting of a scene that meets `target`, and notes it on stderr unless `quiet`.
 ///
 /// # Errors
-/// Nothing keeps it: names what would.
-pub fn choose(
-    place: &mut dyn TestBed,
-    target: &QualityTarget,
-    quiet: bool,
-) -> Result<Chosen, Fail> {
+/// No setting meets the target (the message names one that would), the scene can't be drawn, the
+/// job of a cluster fails, or the user stopped it.
+pub fn choose(bed: &mut dyn TestBed, target: &QualityTarget, quiet: bool) -> Result<Chosen, Fail> {
     let began = Instant::now();
-    let mut kept = MeasurementCache::of(place.identity());
-    let (base, size) = (place.base(), place.size());
+    let mut cache = MeasurementCache::open(bed.identity());
+    let (base, size) = (bed.base(), bed.size());
     let rungs = ladder(&base, size);
-    let known = kept.len();
+    let known = cache.len();
     let mut progress = Progress::new(quiet).counting("pixel");
     progress.phase("choosing a setting");
     if known == 0 && !quiet {
         progress::note(&format!(
-            "{}: this scene is measured first; that is kept for the next time",
+            "{}: measuring this scene first; the result is kept for the next time",
             target.flags()
         ));
     }
     let times = Vec::new();
-    let mut climb = Climb { place, kept: &mut kept, times, progress, measured: 0 };
+    let mut climb = Climb { bed, cache: &mut cache, times, progress, measured: 0 };
     let by_error = target.error.is_some() || target.error_max.is_some();
     let chosen =
         if by_error { climb.by_error(target, &rungs) } else { climb.by_time(target, &rungs) };
     let measured = climb.measured;
     climb.progress.end();
-    // What was measured serves also where nothing was found.
+    // The measurements serve the next run even if no setting met the target.
     if measured > 0 {
-        kept.save();
+        cache.save();
     }
     let chosen = chosen?;
     if !quiet {
@@ -279,8 +278,8 @@ pub fn choose(
             fraction(q.eps),
             super::setting::lower(&q.sums),
             if chosen.setting == base { " (the default)" } else { "" },
-            chosen.off.rmse,
-            chosen.off.most_999,
+            chosen.deviation.rmse,
+            chosen.deviation.most_999,
             chosen.ms,
         ));
     }
@@ -288,7 +287,7 @@ pub fn choose(
 }
 
 impl Chosen {
-    /// Puts it into what was asked for.
+    /// Replaces the target of `request` by the chosen quality, size and magnification.
     pub fn settle(&self, request: &mut RenderRequest) {
         request.target = QualityTarget::default();
         request.quality = self.setting.quality;
@@ -299,7 +298,11 @@ impl Chosen {
     }
 }
 
-/// A scene that is asked for with a target, to be tried out by this process.
+/// Returns a trial of the requested scene in this process. A turntable is tried all around, so that
+/// the measurements serve every turn of the scene.
+///
+/// # Errors
+/// The request does not fit the volume.
 pub fn trial(
     volume: &Arc<Volume>,
     info: &VolumeInfo,
@@ -312,9 +315,9 @@ pub fn trial(
     Trial::new(volume.clone(), info.clone(), &around, orientation, threads)
 }
 
-/// Chooses the quality of what was asked for if it names none but what it should come to, by plain
-/// drawing. `volume` fits it.
-pub fn settle(
+/// Chooses the quality of a request that has a target, by plain drawing on `threads` threads; leaves
+/// one without a target as it is. The request must fit the volume.
+pub(crate) fn settle(
     volume: &Arc<Volume>,
     info: &VolumeInfo,
     request: &mut RenderRequest,
@@ -348,10 +351,10 @@ mod tests {
     }
 
     #[test]
-    fn targets_are_kept_with_room_to_spare() {
+    fn targets_are_kept_with_a_margin() {
         let target = QualityTarget { error: Some(1.0 / 255.0), ..QualityTarget::default() };
-        let off = |rmse| Deviation { rmse, ..Deviation::default() };
-        assert!(keeps_error(&target, &off(0.8)) && !keeps_error(&target, &off(0.95)));
+        let deviation = |rmse| Deviation { rmse, ..Deviation::default() };
+        assert!(keeps_error(&target, &deviation(0.8)) && !keeps_error(&target, &deviation(0.95)));
         let target = QualityTarget { budget: Some(100.0), error_max: Some(2.0 / 255.0), ..target };
         assert!(keeps_time(&target, 90.0) && !keeps_time(&target, 91.5));
         assert_eq!(target.flags(), "--error, --error-max, --budget");

@@ -1,8 +1,8 @@
-//! A cluster that tries settings: how long a frame takes there, and, where the volume is not here, how
-//! far its pictures are from its own finest.
+//! Tries settings on a cluster: frame times, and, where only the cluster has the volume, the error
+//! against its own finest pictures.
 //!
-//! What is timed is what a person waits for: frames of the path, one after the other, magnified and made
-//! PNGs as they arrive, which takes the same cores where the cluster is in this process.
+//! The time is what a user waits for: consecutive frames of the path, magnified and encoded as PNG
+//! as they arrive. Where the cluster is in this process, that takes the same cores.
 
 use super::setting::Setting;
 use super::test_bed::{TestBed, VIEWS};
@@ -27,62 +27,57 @@ use tokio::task::JoinSet;
 
 /// Frames that are timed of a setting, after the first.
 const FRAMES: u32 = 4;
-/// The same of one whose time is near the budget.
-const MORE: u32 = 12;
-/// What counts as near: within this factor.
+/// Frames that are timed of a setting whose time is near the budget.
+const FRAMES_NEAR_BUDGET: u32 = 12;
+/// Ratio of a time to the budget, or its inverse, below which the time is near the budget.
 const NEAR: f64 = 1.6;
 
-/// The finest setting, whose pictures are the truth where there is no reference. Sheets twice as thin were
-/// 0.019 to 0.034 of 1/255 from the limit (ARCHITECTURE.md), which is mostly rounded positions.
-const FINEST: Finest = Finest { thickness: 0.125, eps: 1.0 / 65536.0, off: 0.05 };
+/// The finest setting, whose pictures are the truth where there is no reference. Sheets twice as
+/// thin were 0.019 to 0.034 of 1/255 from the limit (ARCHITECTURE.md), mostly by rounded positions.
+const FINEST: Finest = Finest { thickness: 0.125, eps: 1.0 / 65536.0, rmse: 0.05 };
 
 struct Finest {
     thickness: f64,
     eps: f64,
-    /// RMSE of it in 1/255, which is added to what is found.
-    off: f64,
+    /// RMSE of the finest setting in 1/255, which is added to measured errors.
+    rmse: f64,
 }
 
-/// Whom frames are asked of.
+/// The connection to the master that renders the frames.
 pub enum Connection<'a> {
-    /// A master of this process.
+    /// A master in this process.
     Embedded(&'a Handle),
-    /// One behind a network.
+    /// A master behind a network.
     Remote(&'a Client),
 }
 
-/// A cluster, and the job that it is to be tried with.
+/// A cluster and the job that settings are tried with.
 pub struct ClusterRun<'a> {
-    /// Runs the connection.
+    /// Runtime that drives the connection.
     pub runtime: &'a Runtime,
     /// The master that renders.
-    pub wire: Connection<'a>,
+    pub connection: Connection<'a>,
     /// The volume, with its digest.
     pub info: VolumeInfo,
-    /// What was asked for; it fits the volume.
+    /// The request of the user; it must fit the volume.
     pub request: RenderRequest,
-    /// What the cluster is, for messages.
-    pub crew: String,
+    /// Description of the cluster for messages: `the cluster of HOST:PORT`.
+    pub description: String,
 }
 
 impl ClusterRun<'_> {
-    /// Returns a description of the cluster for messages.
-    pub fn crew(&self) -> &str {
-        &self.crew
-    }
-
-    /// Milliseconds from one frame of the path to the next. Views are far apart, so that a few stand for
-    /// all; the first is left out, for which bricks are cut and sent.
-    pub fn ms(&self, setting: &Setting) -> Result<f64, Fail> {
-        let few = self.each(setting, FRAMES)?;
+    /// Returns the ms from one frame of the path to the next. Views are far apart, so that a few
+    /// stand for all. The first, for which bricks are cut and sent, is left out.
+    pub(crate) fn ms(&self, setting: &Setting) -> Result<f64, Fail> {
+        let ms = self.interval_ms(setting, FRAMES)?;
         let budget = self.request.target.budget.unwrap_or(f64::INFINITY);
-        let near = few < NEAR * budget && few * NEAR > budget;
-        if near { self.each(setting, MORE) } else { Ok(few) }
+        let near = ms < NEAR * budget && ms * NEAR > budget;
+        if near { self.interval_ms(setting, FRAMES_NEAR_BUDGET) } else { Ok(ms) }
     }
 
-    fn each(&self, setting: &Setting, frames: u32) -> Result<f64, Fail> {
+    fn interval_ms(&self, setting: &Setting, frames: u32) -> Result<f64, Fail> {
         let path = spread(&self.request.path, frames + 1);
-        // Floats are what small pictures are sent as.
+        // Pictures that are magnified here are sent as floats.
         let format = if setting.shrink > 1 { PixelFormat::Rgba32F } else { PixelFormat::Rgb8 };
         let written = Some((setting.shrink, self.request.background));
         let mut came: Vec<f64> =
@@ -92,8 +87,8 @@ impl ClusterRun<'_> {
         Ok((came[n] - came[0]) * 1e3 / n.max(1) as f64)
     }
 
-    /// The frames of a path at a setting, and when each came, in seconds; or, if they are to be `written`
-    /// (so many times larger, over this background), when that would be done.
+    /// Renders a path at a setting. Returns each frame and the seconds until it arrived or, with
+    /// `written` (magnification, background), until it was encoded.
     fn frames(
         &self,
         setting: &Setting,
@@ -107,26 +102,26 @@ impl ClusterRun<'_> {
         request.path.size = setting.drawn_size(request.path.size).unwrap_or(request.path.size);
         let message = request.to_message(&self.info, format, false);
         self.runtime.block_on(async {
-            let mut source = match &self.wire {
+            let mut source = match &self.connection {
                 Connection::Embedded(handle) => embedded::submit(handle, &request, message).await?,
                 Connection::Remote(client) => {
                     remote::submit((*client).clone(), &request, message).await?
                 }
             };
-            let taken = take(&mut source, written).await;
-            if taken.is_err() {
+            let received = receive(&mut source, written).await;
+            if received.is_err() {
                 source.cancel.now().await;
             }
-            taken
+            received
         })
     }
 }
 
-async fn take(
+async fn receive(
     source: &mut Source,
     written: Option<(u32, Background)>,
 ) -> Result<Vec<(Frame, f64)>, Fail> {
-    let (began, mut frames, mut told) = (Instant::now(), Vec::new(), false);
+    let (began, mut frames, mut noted) = (Instant::now(), Vec::new(), false);
     let mut writing = JoinSet::new();
     loop {
         let update = tokio::select! {
@@ -147,9 +142,9 @@ async fn take(
                 }
             },
             Some(Ok(Update::Step(step))) => {
-                if !step.waiting.is_empty() && !told {
+                if !step.waiting.is_empty() && !noted {
                     progress::note(&step.waiting);
-                    told = true;
+                    noted = true;
                 }
             }
         }
@@ -158,7 +153,7 @@ async fn take(
     Ok(frames)
 }
 
-/// What writing a frame takes but for the disk.
+/// Magnifies and encodes a frame as when it is written, without the disk.
 fn write(frame: &Frame, times: u32, background: Background) {
     let large = (times > 1).then(|| {
         let picture = magnified(frame.picture(), times, 1);
@@ -166,12 +161,13 @@ fn write(frame: &Frame, times: u32, background: Background) {
         Frame { size: picture.size, format: PixelFormat::Rgb8, bytes, ..frame.clone() }
     });
     let mut file = Vec::new();
-    // Into memory: nothing to fail.
+    // Writing into memory can't fail.
     let _ = png::encode(large.as_ref().unwrap_or(frame), "", &mut file);
     std::hint::black_box(file);
 }
 
-/// So many views that stand for a path: a turn's, far apart; of others the first ones.
+/// Returns a path of `views` views that stand for `path`: spread over a turntable, the first ones
+/// of any other path.
 fn spread(path: &ViewPath, views: u32) -> ViewPath {
     let mut path = path.clone();
     let frames = path.frames().max(1) as u32;
@@ -179,7 +175,7 @@ fn spread(path: &ViewPath, views: u32) -> ViewPath {
     match &mut path.turntable {
         Some(turn) => {
             turn.start += turn.step * first as f64;
-            // A single picture is timed beside others like it.
+            // A single picture is timed with views next to it.
             let over = turn.step * f64::from(frames - 1);
             turn.step = if over == 0.0 { 1.0 } else { over / f64::from(views - 1) };
             turn.frames = views;
@@ -193,25 +189,25 @@ fn spread(path: &ViewPath, views: u32) -> ViewPath {
     path
 }
 
-/// A cluster whose volume is not here.
+/// A test bed on a cluster that alone has the volume.
 pub struct ClusterBed<'a> {
-    through: ClusterRun<'a>,
+    run: ClusterRun<'a>,
     base: Setting,
-    /// Pictures of the finest setting.
+    /// Pictures of the finest setting, as premultiplied RGBA.
     truths: Vec<(ViewPath, Vec<[f64; 4]>)>,
 }
 
 impl<'a> ClusterBed<'a> {
-    /// Returns a test bed on a cluster that alone has the volume.
-    pub fn new(through: ClusterRun<'a>) -> ClusterBed<'a> {
-        let base = Setting::asked(through.request.quality);
-        ClusterBed { through, base, truths: Vec::new() }
+    /// Returns a test bed that judges and times settings by jobs of the given cluster.
+    pub fn new(run: ClusterRun<'a>) -> ClusterBed<'a> {
+        let base = Setting::asked(run.request.quality);
+        ClusterBed { run, base, truths: Vec::new() }
     }
 
     fn picture(&self, setting: &Setting, path: &ViewPath) -> Result<Picture, Fail> {
-        let frames = self.through.frames(setting, path.clone(), PixelFormat::Rgba32F, None)?;
+        let frames = self.run.frames(setting, path.clone(), PixelFormat::Rgba32F, None)?;
         let [(frame, _)] = &frames[..] else {
-            return Err(Fail::failed(format!("one frame was asked for, {} came", frames.len())));
+            return Err(Fail::failed(format!("one frame was requested, {} arrived", frames.len())));
         };
         Ok(magnified(frame.picture(), setting.shrink, machine::cores() as usize))
     }
@@ -236,15 +232,15 @@ impl TestBed for ClusterBed<'_> {
     }
 
     fn size(&self) -> [u32; 2] {
-        self.through.request.path.size
+        self.run.request.path.size
     }
 
-    fn crew(&self) -> String {
-        self.through.crew.clone()
+    fn description(&self) -> String {
+        self.run.description.clone()
     }
 
     fn identity(&self) -> String {
-        let ClusterRun { request, info, .. } = &self.through;
+        let ClusterRun { request, info, .. } = &self.run;
         let around = all_around(&request.path);
         format!(
             "judged by its finest pictures: volume {} transfer {:?} path {} quality {:?} background \
@@ -259,18 +255,18 @@ impl TestBed for ClusterBed<'_> {
         )
     }
 
-    /// Workers come and go.
+    /// Returns false: workers come and go.
     fn keeps_times(&self) -> bool {
         false
     }
 
-    fn off(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Deviation, Fail> {
+    fn deviation(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Deviation, Fail> {
         if self.truths.is_empty() {
-            let path = all_around(&self.through.request.path);
+            let path = all_around(&self.run.request.path);
             let (views, finest) = (path.frames(), self.finest());
             let n = VIEWS.min(views);
             for i in 0..n {
-                progress.phase(&format!("drawing what it should be, view {} of {n}", i + 1));
+                progress.phase(&format!("drawing the exact picture, view {} of {n}", i + 1));
                 let view = path.single_frame(path.first_frame() + (2 * i + 1) * views / (2 * n));
                 let picture = self.picture(&finest, &view)?;
                 let truth = picture.pixels.iter().map(|p| p.map(f64::from)).collect();
@@ -278,29 +274,29 @@ impl TestBed for ClusterBed<'_> {
             }
             progress.phase("trying settings");
         }
-        let mut off = Deviation::default();
+        let mut deviation = Deviation::default();
         for (view, truth) in &self.truths {
             let picture = self.picture(setting, view)?;
             let figures =
-                ErrorFigures::compare(&picture.pixels, truth, self.through.request.background);
-            off = off.with(&figures);
+                ErrorFigures::compare(&picture.pixels, truth, self.run.request.background);
+            deviation = deviation.worst(&figures);
         }
-        off.rmse = libm::hypot(off.rmse, FINEST.off);
+        deviation.rmse = libm::hypot(deviation.rmse, FINEST.rmse);
         Ok(Deviation {
-            most_999: off.most_999 + 2.0 * FINEST.off,
-            max: off.max + 2.0 * FINEST.off,
-            ..off
+            most_999: deviation.most_999 + 2.0 * FINEST.rmse,
+            max: deviation.max + 2.0 * FINEST.rmse,
+            ..deviation
         })
     }
 
     fn ms(&mut self, setting: &Setting) -> Result<f64, Fail> {
-        self.through.ms(setting)
+        self.run.ms(setting)
     }
 }
 
-/// What stands for a turn: views far apart all around, wherever the turn itself goes, so that what is
-/// measured serves any turn of the scene. Other paths stand for themselves.
-pub fn all_around(path: &ViewPath) -> ViewPath {
+/// Returns the path that settings are tried on. For a turntable, [`VIEWS`] views all around, so that
+/// measurements serve any turn of the scene; any other path is returned as it is.
+pub(crate) fn all_around(path: &ViewPath) -> ViewPath {
     let mut path = path.clone();
     if let Some(turn) = &mut path.turntable {
         (turn.start, turn.step, turn.frames) = (20.0, 71.0, VIEWS as u32);
@@ -315,7 +311,7 @@ mod tests {
     use slabcast_scene::path::Turntable;
 
     #[test]
-    fn few_views_stand_for_a_path() {
+    fn spread_covers_a_turntable_with_few_views() {
         let turn = |frames, step| {
             let turn = Turntable { frames, step, start: 10.0, ..Turntable::default() };
             ViewPath::from_turntable([64, 64], turn)

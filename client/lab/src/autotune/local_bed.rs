@@ -2,27 +2,27 @@
 
 use super::cluster_bed::ClusterRun;
 use super::setting::Setting;
-use super::test_bed::{TestBed, VIEWS, stopped};
+use super::test_bed::{TestBed, VIEWS, check_not_stopped};
 use super::trial::{Deviation, Effort, Trial, Truth};
 use slabcast_session::direct::Cut;
 use slabcast_session::fail::Fail;
 use slabcast_session::machine;
 use slabcast_session::progress::Progress;
 
-/// Pixels of each. The RMSE of half as many differed by a tenth between samples.
+/// Pixels judged of each view. With half as many the RMSE differed by a tenth between samples.
 const PIXELS: usize = 3072;
-/// Seconds for which frames are timed, after the least that make a median.
+/// Seconds for which frames of a setting are timed, once there are enough for a median.
 const SECONDS: f64 = 0.25;
 
-/// What times a frame.
+/// How the frames of a setting are timed.
 pub enum Clock<'a> {
-    /// Plain drawing, as `slabcast lab bench` does.
+    /// By plain drawing without a scheduler, as `slabcast lab bench` does.
     Plain(Cut),
-    /// A cluster of this process, as `slabcast render` has.
+    /// By a cluster in this process, as `slabcast render` has.
     Cluster(Box<ClusterRun<'a>>),
 }
 
-/// This process.
+/// A test bed in this process, judged by the reference.
 pub struct LocalBed<'a> {
     trial: Trial,
     clock: Clock<'a>,
@@ -45,17 +45,17 @@ impl TestBed for LocalBed<'_> {
         self.trial.size()
     }
 
-    fn crew(&self) -> String {
+    fn description(&self) -> String {
         match &self.clock {
             Clock::Plain(cut) => format!("{} threads", cut.threads),
-            Clock::Cluster(through) => through.crew().into(),
+            Clock::Cluster(run) => run.description.clone(),
         }
     }
 
     fn identity(&self) -> String {
         let clock = match &self.clock {
             Clock::Plain(cut) => format!("{cut:?}"),
-            Clock::Cluster(through) => through.crew().into(),
+            Clock::Cluster(run) => run.description.clone(),
         };
         format!("{} {} {clock}", self.trial.identity(), machine::cpu())
     }
@@ -64,20 +64,20 @@ impl TestBed for LocalBed<'_> {
         true
     }
 
-    fn off(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Deviation, Fail> {
+    fn deviation(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Deviation, Fail> {
         if self.truths.is_empty() {
             let views = self.trial.views();
             let n = VIEWS.min(views);
             progress.frames((n * PIXELS) as u64, "");
             for i in 0..n {
                 let view = (2 * i + 1) * views / (2 * n);
-                let told = (&mut *progress, i * PIXELS);
-                self.truths.push(self.trial.truth(view, PIXELS, 1, told)?);
-                stopped()?;
+                let counter = (&mut *progress, i * PIXELS);
+                self.truths.push(self.trial.truth(view, PIXELS, 1, counter)?);
+                check_not_stopped()?;
             }
             progress.phase("trying settings");
         }
-        Ok(self.trial.judge(setting, &self.truths, None)?.off)
+        Ok(self.trial.judge(setting, &self.truths, None)?.deviation)
     }
 
     fn ms(&mut self, setting: &Setting) -> Result<f64, Fail> {
@@ -86,7 +86,7 @@ impl TestBed for LocalBed<'_> {
                 let effort = Effort { cut: *cut, seconds: SECONDS };
                 Ok(self.trial.time(setting, effort)?.median)
             }
-            Clock::Cluster(through) => through.ms(setting),
+            Clock::Cluster(run) => run.ms(setting),
         }
     }
 }

@@ -1,17 +1,18 @@
-//! Error against run time: what a picture may be drawn with, what that costs, and which of it is
-//! worth having.
+//! Error against run time: measures quality settings and chooses the one that meets a target.
 //!
-//! [`setting`] names one way to draw a scene, [`trial`] draws it, times it and has the reference judge
-//! it (`slabcast_session::magnify` for pictures that are drawn small), [`pareto`] says which of many no other
-//! beats, and where more time stops to pay. `report` sweeps all of it; `--error` and `--budget`
-//! [`choose`](mod@choose) from a ladder of settings and keep what they measured ([`cache`]). They do so
-//! in a [`test_bed`]: this process ([`local_bed`]), or a cluster ([`cluster_bed`]), whose volume may be elsewhere.
+//! - `setting`: one way to draw a scene (quality, size, light).
+//! - `trial`: draws a setting, times it and has the reference judge it.
+//! - `pareto`: the Pareto front of many settings and its knee. `report` sweeps them all.
+//! - [`choose`](mod@choose): picks a setting for `--error` and `--budget` from a ladder.
+//! - `cache`: keeps measurements between runs.
+//! - `test_bed`: where settings are tried: this process ([`local_bed`]) or a cluster
+//!   ([`cluster_bed`]), which may be the only one with the volume.
 
 mod cache;
 pub mod choose;
 pub mod cluster_bed;
 pub mod local_bed;
 pub(crate) mod pareto;
-pub mod setting;
-pub mod test_bed;
-pub mod trial;
+pub(crate) mod setting;
+pub(crate) mod test_bed;
+pub(crate) mod trial;

@@ -1,22 +1,22 @@
-//! Which of many settings no other beats, and where more time stops to pay.
+//! The Pareto front of settings by time and error, and its knee.
 
-/// A setting's cost and error; less is better in both.
+/// Time and error of a setting; less is better in both.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Point {
-    /// Milliseconds a frame.
+    /// Frame time in ms.
     pub(crate) ms: f64,
-    /// In 1/255.
+    /// Error in 1/255.
     pub(crate) error: f64,
 }
 
-/// More time has to lower the error by this share at least. Differences below it are those of one
-/// sample of pixels from another, and a front would follow them for ever (an eightfold time for
+/// Least share by which a slower setting has to lower the error. Smaller differences are those
+/// between samples of pixels, and a front would follow them for ever (eight times the time for
 /// half a percent, on mri256 in `peer-semi`).
 pub(crate) const WORTH: f64 = 0.02;
 
-/// Places of the points that no other is both faster and nearer to the truth than, or as near but
-/// for [`WORTH`]; from fast to slow. Of points that are alike the first is taken; what is not finite
-/// never is.
+/// Returns the indices of the Pareto front, from fast to slow: each point's error is lower than that
+/// of every faster one by [`WORTH`] or more. Of equal points the first is taken; points that are
+/// not finite are left out.
 pub(crate) fn front(points: &[Point]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len())
         .filter(|&i| points[i].ms.is_finite() && points[i].error.is_finite())
@@ -36,15 +36,15 @@ pub(crate) fn front(points: &[Point]) -> Vec<usize> {
     order
 }
 
-/// Of a front's points the knee: the one farthest below the straight line between the front's ends
-/// where both axes are logarithms ("kneedle", Satopaa et al. 2011). `None` for fewer than three
-/// points, or where none lies below that line.
+/// Returns the index of a front's knee: the point farthest below the straight line between the ends
+/// of the front, with both axes logarithmic ("kneedle", Satopaa et al. 2011). `None` for fewer than
+/// three points, or where none lies below that line.
 pub(crate) fn knee(points: &[Point], front: &[usize]) -> Option<usize> {
-    let at = |i: usize| [libm::log(points[i].ms), libm::log(points[i].error.max(1e-9))];
-    let (first, last) = (at(*front.first()?), at(*front.last()?));
+    let logs = |i: usize| [libm::log(points[i].ms), libm::log(points[i].error.max(1e-9))];
+    let (first, last) = (logs(*front.first()?), logs(*front.last()?));
     let run = [last[0] - first[0], last[1] - first[1]];
     let below = |i: usize| {
-        let [x, y] = at(i);
+        let [x, y] = logs(i);
         // Along the line as far as the point, then down.
         first[1] + run[1] * (x - first[0]) / run[0] - y
     };
@@ -62,7 +62,7 @@ mod tests {
     }
 
     #[test]
-    fn the_front_and_its_knee() {
+    fn front_and_knee_of_known_points() {
         let p = points(&[
             (10.0, 1.0),
             (1.0, 10.0),
@@ -83,7 +83,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn nothing_beats_the_front(of in prop::collection::vec((0.1f64..1e3, 1e-3f64..1e2), 0..60)) {
+        fn no_point_beats_the_front(of in prop::collection::vec((0.1f64..1e3, 1e-3f64..1e2), 0..60)) {
             let p = points(&of);
             let f = front(&p);
             for i in 0..p.len() {

@@ -1,40 +1,41 @@
-//! One way to draw a scene.
+//! One way to draw a scene: quality, size and light.
 
 use serde::{Deserialize, Serialize};
 use slabcast_common::quality::{Kernel, Quality, Sums};
 
-/// What may be chosen of a picture, beside what it shows.
+/// Everything about a picture that may be traded for time.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Setting {
     /// Quality at which the picture is drawn.
     pub(crate) quality: Quality,
-    /// The picture is drawn so many times smaller along each edge, and magnified.
+    /// Factor by which each edge of the picture is drawn smaller and then magnified; 1 is full size.
     pub(crate) shrink: u32,
-    /// Whether light falls on voxels, where the scene has it.
+    /// Whether voxels are shaded, in a scene with shading.
     pub(crate) shaded: bool,
 }
 
 impl Setting {
-    /// What was asked for.
+    /// Returns the setting that a user asked for: full size, shaded.
     pub(crate) fn asked(quality: Quality) -> Setting {
         Setting { quality, shrink: 1, shaded: true }
     }
 
-    /// Whether it shows what `other` shows as sheets become thin: whether it differs in the
-    /// approximation alone, and not in the model.
+    /// Returns whether both settings have the same limit as sheets become thin: whether they differ
+    /// in the approximation alone, not in the model.
     pub(crate) fn same_model(&self, other: &Setting) -> bool {
         let (a, b) = (&self.quality, &other.quality);
         self.shaded == other.shaded && (a.kernel, a.std, a.radius) == (b.kernel, b.std, b.radius)
     }
 
-    /// Size of the picture that is drawn for one of `size`; `None` where it is no whole number.
+    /// Returns the size that is drawn for a picture of `size`, in pixels; `None` where `shrink` does
+    /// not divide it.
     pub(crate) fn drawn_size(&self, size: [u32; 2]) -> Option<[u32; 2]> {
         let whole = size.iter().all(|n| n % self.shrink == 0);
         whole.then(|| size.map(|n| n / self.shrink))
     }
 
-    /// How it differs from `base`, in the words of the flags: `thickness 0.5, i16`.
+    /// Returns how the setting differs from `base`, in the words of the flags: `thickness 0.5, i16`.
     pub(crate) fn name(&self, base: &Setting) -> String {
         let (q, b) = (&self.quality, &base.quality);
         let mut words = Vec::new();
@@ -68,7 +69,7 @@ impl Setting {
         if words.is_empty() { "as asked".into() } else { words.join(", ") }
     }
 
-    /// The flags that make it, for people who type them.
+    /// Returns the flags that turn `base` into this setting.
     pub(crate) fn flags(&self, base: &Setting, size: [u32; 2]) -> String {
         let (q, b) = (&self.quality, &base.quality);
         let mut flags = Vec::new();
@@ -103,13 +104,13 @@ impl Setting {
     }
 }
 
-/// A word of a flag.
-pub fn lower(word: &impl std::fmt::Debug) -> String {
+/// Returns the name of an enum's value in lower case, as flags have it.
+pub(crate) fn lower(word: &impl std::fmt::Debug) -> String {
     format!("{word:?}").to_lowercase()
 }
 
-/// `1/512` where it is one over a whole number.
-pub fn fraction(x: f64) -> String {
+/// Returns `1/512` for one over a whole number, and a decimal number for any other.
+pub(crate) fn fraction(x: f64) -> String {
     let over = (1.0 / x).round();
     if x > 0.0 && over > 1.0 && over < 1e7 && (1.0 / over - x).abs() <= 1e-12 * x {
         return format!("1/{over}");
@@ -122,7 +123,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_setting_is_called_by_what_it_changes() {
+    fn setting_is_named_by_its_differences() {
         let base = Setting::asked(Quality::default());
         assert_eq!(base.name(&base), "as asked");
         assert_eq!(base.flags(&base, [512, 512]), "");

@@ -1,4 +1,5 @@
-//! Where settings are tried: this process, which has the volume and the reference, or a cluster.
+//! Where settings are tried: in this process, which has the volume and the reference, or on a
+//! cluster.
 
 use super::setting::Setting;
 use super::trial::Deviation;
@@ -6,28 +7,35 @@ use slabcast_session::fail::Fail;
 use slabcast_session::progress::Progress;
 use slabcast_session::signals;
 
-/// Views that are judged. By three, sheets of 4 vox were taken for bonsai in `peer-semi`, whose error
-/// is twice as large from other sides.
-pub const VIEWS: usize = 5;
-/// Draws a scene in one setting after another and says what comes of it.
+/// Views that are judged. With three, sheets of 4 vox were chosen for bonsai in `peer-semi`, whose
+/// error is twice as large from other sides.
+pub(crate) const VIEWS: usize = 5;
+
+/// Draws one scene at one setting after another, and measures error and time.
 pub trait TestBed {
-    /// What was asked for.
+    /// Returns the setting that the user asked for.
     fn base(&self) -> Setting;
-    /// Size of the pictures.
+    /// Returns the size of the pictures in pixels: width, height.
     fn size(&self) -> [u32; 2];
-    /// What draws, for messages: `2 threads`.
-    fn crew(&self) -> String;
-    /// All that what is measured hangs on. What has the same identity is not measured again.
+    /// Returns a description of what draws, for messages: `2 threads`.
+    fn description(&self) -> String;
+    /// Returns a text of everything the measurements depend on. Measurements are kept by it.
     fn identity(&self) -> String;
-    /// Whether times have that identity, too.
+    /// Returns whether frame times, too, may be kept by [`TestBed::identity`].
     fn keeps_times(&self) -> bool;
-    /// How far its pictures are from the truth.
-    fn off(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Deviation, Fail>;
-    /// Milliseconds of a frame.
+    /// Returns the error of a setting's pictures against the truth; draws the truth first.
+    ///
+    /// # Errors
+    /// The scene can't be drawn at this setting, the job of a cluster fails, or the user stopped it.
+    fn deviation(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Deviation, Fail>;
+    /// Returns the median time of a frame in ms.
+    ///
+    /// # Errors
+    /// The scene can't be drawn at this setting, the job of a cluster fails, or the user stopped it.
     fn ms(&mut self, setting: &Setting) -> Result<f64, Fail>;
 }
 
-/// Refuses to go on when somebody pressed Ctrl-C.
-pub(super) fn stopped() -> Result<(), Fail> {
+/// Fails if the user pressed Ctrl-C.
+pub(super) fn check_not_stopped() -> Result<(), Fail> {
     if signals::stop_requested() { Err(Fail::failed("stopped while choosing")) } else { Ok(()) }
 }

@@ -1,8 +1,8 @@
-//! Draws a scene in one setting after another, times it, and has the reference judge it.
+//! Draws a scene at one setting after another, times it, and has the reference judge it.
 //!
-//! The truth is what was asked for in the limit of thin sheets: with its kernel, its light, at its
-//! size. A setting that changes the model (another kernel, no light) is judged by that truth like
-//! any other, and beside it by its own.
+//! The truth is the requested picture in the limit of thin sheets: with its kernel, its light, at
+//! its size. A setting that changes the model (another kernel, no light) is judged by that truth
+//! like any other, and also by the limit of its own model.
 
 use super::setting::Setting;
 use serde::{Deserialize, Serialize};
@@ -23,25 +23,25 @@ use slabcast_session::request::RenderRequest;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Frames that are timed at least, unless they take long. The median of two is none.
+/// Least number of frames that are timed for a median, unless one takes longer than [`LONG_S`].
 const FRAMES: usize = 3;
-/// A frame that takes so long is not repeated for its median, nor is one drawn before it to fill
+/// Seconds above which a frame is neither repeated for a median nor preceded by one that fills
 /// tables, which take milliseconds.
-const LONG: f64 = 1.0;
-/// Frames that are timed at most.
+const LONG_S: f64 = 1.0;
+/// Largest number of frames that are timed.
 const MOST_FRAMES: usize = 51;
 
-/// What one view should look like, at a sample of its pixels.
-pub struct Truth {
-    /// Number of the view among those that are wanted.
+/// The exact colours of one view at a sample of its pixels.
+pub(crate) struct Truth {
+    /// Index of the view on the path.
     pub(crate) view: usize,
     sample: Vec<[u32; 2]>,
     limit: Vec<[f64; 4]>,
 }
 
-/// Milliseconds from camera set to picture in memory.
+/// Frame times in ms, from camera set to picture in memory.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Timing {
+pub(crate) struct Timing {
     /// Median time of a frame, in ms.
     pub(crate) median: f64,
     pub(crate) min: f64,
@@ -50,18 +50,18 @@ pub struct Timing {
 }
 
 impl Timing {
-    /// Of some frames.
+    /// Returns median, minimum and maximum of some frame times.
     ///
     /// # Panics
     /// If there are none.
-    pub(crate) fn of(mut ms: Vec<f64>) -> Timing {
+    pub(crate) fn from_ms(mut ms: Vec<f64>) -> Timing {
         ms.sort_by(f64::total_cmp);
         let (min, max) = (ms[0], ms[ms.len() - 1]);
         Timing { median: ms[ms.len() / 2], min, max, frames: ms.len() as u32 }
     }
 }
 
-/// How far some pictures are from the truth: the worst view of each figure, in 1/255.
+/// Errors of some pictures against the truth, in 1/255: the worst view for each figure.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Deviation {
     pub(crate) rmse: f64,
@@ -69,13 +69,13 @@ pub struct Deviation {
     pub(crate) most_999: f64,
     pub(crate) share_above_1: f64,
     pub(crate) rmse_srgb8: f64,
-    /// Pixels that are not blank, in all.
+    /// Number of pixels that are not blank, in all views.
     pub(crate) pixels: usize,
 }
 
 impl Deviation {
-    /// The worse of each figure.
-    pub(super) fn with(self, f: &ErrorFigures) -> Deviation {
+    /// Returns the worse of each figure.
+    pub(super) fn worst(self, f: &ErrorFigures) -> Deviation {
         Deviation {
             rmse: self.rmse.max(f.rmse),
             max: self.max.max(f.max),
@@ -87,32 +87,32 @@ impl Deviation {
     }
 }
 
-/// A setting's picture of each judged view.
-pub struct Judged {
-    /// What sheets added in.
+/// Errors of a setting over all judged views.
+pub(crate) struct Judged {
+    /// Arithmetic that the sheets were added in.
     pub(crate) sums: Sums,
-    /// Against the truth.
-    pub(crate) off: Deviation,
-    /// Against its own limit, where its model is another.
+    /// Error against the truth.
+    pub(crate) deviation: Deviation,
+    /// Error against the limit of its own model, if that is another one.
     pub(crate) own: Option<Deviation>,
-    /// Voxels of the first judged view.
+    /// Voxel counts of the first judged view.
     pub(crate) counters: Counters,
-    /// Of the first judged view.
+    /// SHA-256 of the pixels of the first judged view.
     pub(crate) sha256: String,
 }
 
-/// How its time is measured.
+/// How the time of a setting is measured.
 #[derive(Clone, Copy, Debug)]
-pub struct Effort {
+pub(crate) struct Effort {
     pub(crate) cut: Cut,
-    /// As many frames as fit, after the least.
+    /// Seconds for which frames are timed, once there are [`FRAMES`].
     pub(crate) seconds: f64,
 }
 
-/// What bricks a setting is drawn from.
-type Ground = (bool, bool);
+/// Kind of bricks that a setting is drawn from: with normals, by the paper's opacities.
+type BrickKind = (bool, bool);
 
-/// One volume and path, to be drawn in many ways.
+/// One volume and one path, drawn at many settings.
 pub struct Trial {
     volume: Arc<Volume>,
     info: VolumeInfo,
@@ -120,11 +120,11 @@ pub struct Trial {
     orientation: Orientation,
     pub(crate) base: Setting,
     pub(crate) threads: usize,
-    grounds: Vec<(Ground, PathScenes)>,
+    scenes_by_kind: Vec<(BrickKind, PathScenes)>,
 }
 
 impl Trial {
-    /// Cuts the bricks of what was asked for; `volume` fits it.
+    /// Cuts the bricks of the request, which must fit `volume`.
     pub(crate) fn new(
         volume: impl Into<Arc<Volume>>,
         info: VolumeInfo,
@@ -133,9 +133,9 @@ impl Trial {
         threads: usize,
     ) -> Result<Trial, Fail> {
         let volume = volume.into();
-        let stage = PathScenes::new(&volume, &info, request, orientation)?;
+        let scenes = PathScenes::new(&volume, &info, request, orientation)?;
         let base = Setting::asked(request.quality);
-        let ground = ground(&base);
+        let kind = brick_kind(&base);
         let request = request.clone();
         Ok(Trial {
             volume,
@@ -144,15 +144,15 @@ impl Trial {
             orientation,
             base,
             threads,
-            grounds: vec![(ground, stage)],
+            scenes_by_kind: vec![(kind, scenes)],
         })
     }
 
-    /// All that the figures of a setting hang on but the machine. Where on its path a view of a turn
-    /// lies is not in it: a turn's figures serve any other of the same scene.
+    /// Returns a text of everything that a setting's figures depend on, except the machine. The
+    /// angles of a turntable are not in it: its figures serve any other turn of the scene.
     pub(crate) fn identity(&self) -> String {
-        let stage = &self.grounds[0].1;
-        let transfer = stage.spec(0).transfer.to_json();
+        let scenes = &self.scenes_by_kind[0].1;
+        let transfer = scenes.spec(0).transfer.to_json();
         let path = &self.request.path;
         let how = match &path.turntable {
             Some(t) => format!(
@@ -170,35 +170,38 @@ impl Trial {
         )
     }
 
-    /// Size of the pictures.
+    /// Returns the size of the pictures in pixels.
     pub(crate) fn size(&self) -> [u32; 2] {
         self.request.path.size
     }
 
-    /// Number of views.
+    /// Returns the number of views.
     pub(crate) fn views(&self) -> usize {
         self.request.path.frames()
     }
 
-    /// Whether light falls on voxels in what was asked for.
+    /// Returns whether the requested scene is shaded.
     pub(crate) fn is_shaded(&self) -> bool {
-        self.grounds[0].1.spec(0).transfer.shading.on
+        self.scenes_by_kind[0].1.spec(0).transfer.shading.on
     }
 
-    /// Relevant voxels, and bytes of their bricks as they are sent, of a setting.
+    /// Returns the relevant voxels of a setting and the bytes of their bricks as sent.
     pub(crate) fn bricks(&mut self, setting: &Setting) -> Result<(u64, u64), Fail> {
-        let bricks = &self.stage(setting)?.bricks;
-        let of = |f: fn(&slabcast_common::brick::Brick) -> usize| {
+        let bricks = &self.scenes(setting)?.bricks;
+        let sum = |f: fn(&slabcast_common::brick::Brick) -> usize| {
             bricks.iter().map(|b| f(b) as u64).sum()
         };
-        Ok((of(slabcast_common::brick::Brick::len), of(slabcast_common::brick::Brick::encoded_len)))
+        Ok((
+            sum(slabcast_common::brick::Brick::len),
+            sum(slabcast_common::brick::Brick::encoded_len),
+        ))
     }
 
-    /// The stage of a setting. Without light no normals are cut, and the paper's opacities may
-    /// make other voxels relevant.
-    fn stage(&mut self, setting: &Setting) -> Result<&PathScenes, Fail> {
-        let wanted = ground(setting);
-        let found = self.grounds.iter().position(|(g, _)| *g == wanted);
+    /// Returns the scenes of a setting. Without light the bricks have no normals, and the paper's
+    /// opacities may make other voxels relevant.
+    fn scenes(&mut self, setting: &Setting) -> Result<&PathScenes, Fail> {
+        let wanted = brick_kind(setting);
+        let found = self.scenes_by_kind.iter().position(|(g, _)| *g == wanted);
         let place = match found {
             Some(place) => place,
             None => {
@@ -207,15 +210,15 @@ impl Trial {
                     request.transfer = request.transfer.unshaded();
                 }
                 request.quality.compositing = setting.quality.compositing;
-                let stage = PathScenes::new(&self.volume, &self.info, &request, self.orientation)?;
-                self.grounds.push((wanted, stage));
-                self.grounds.len() - 1
+                let scenes = PathScenes::new(&self.volume, &self.info, &request, self.orientation)?;
+                self.scenes_by_kind.push((wanted, scenes));
+                self.scenes_by_kind.len() - 1
             }
         };
-        Ok(&self.grounds[place].1)
+        Ok(&self.scenes_by_kind[place].1)
     }
 
-    /// What view `view` should look like, at `pixels` of its pixels.
+    /// Returns the truth of view `view` at a stratified sample of `pixels` of its pixels.
     pub(crate) fn truth(
         &mut self,
         view: usize,
@@ -225,28 +228,28 @@ impl Trial {
     ) -> Result<Truth, Fail> {
         let (size, threads, base) = (self.size(), self.threads, self.base);
         let sample = stratified(size, pixels, seed);
-        let stage = self.stage(&base)?;
-        let spec = SceneSpec { quality: base.quality, ..stage.spec(view) };
-        let reference = Reference::new(&spec, stage.view(view, &base.quality)?, &stage.bricks);
+        let scenes = self.scenes(&base)?;
+        let spec = SceneSpec { quality: base.quality, ..scenes.spec(view) };
+        let reference = Reference::new(&spec, scenes.view(view, &base.quality)?, &scenes.bricks);
         let limit = direct::map_pixels(&sample, threads, progress, |[x, y]| reference.pixel(x, y));
         Ok(Truth { view, sample, limit })
     }
 
-    /// The same of a setting's own limit.
-    pub(crate) fn own_truth(&mut self, setting: &Setting, of: &Truth) -> Result<Truth, Fail> {
+    /// Returns the limit of a setting's own model, at the view and pixels of `truth`.
+    pub(crate) fn own_truth(&mut self, setting: &Setting, truth: &Truth) -> Result<Truth, Fail> {
         let threads = self.threads;
-        let stage = self.stage(setting)?;
-        let spec = SceneSpec { quality: setting.quality, ..stage.spec(of.view) };
-        let view = stage.view(of.view, &setting.quality)?;
-        let reference = Reference::new(&spec, view, &stage.bricks);
-        let sample = of.sample.clone();
+        let scenes = self.scenes(setting)?;
+        let spec = SceneSpec { quality: setting.quality, ..scenes.spec(truth.view) };
+        let view = scenes.view(truth.view, &setting.quality)?;
+        let reference = Reference::new(&spec, view, &scenes.bricks);
+        let sample = truth.sample.clone();
         let limit = direct::map_parallel(sample.len(), threads, |i, _: &mut ()| {
             reference.pixel(sample[i][0], sample[i][1])
         });
-        Ok(Truth { view: of.view, sample, limit })
+        Ok(Truth { view: truth.view, sample, limit })
     }
 
-    /// Draws a setting and compares it with what it should be; `own` are its own limits.
+    /// Draws a setting and compares it with `truths`, and with the limits `own` of its own model.
     pub(crate) fn judge(
         &mut self,
         setting: &Setting,
@@ -256,32 +259,33 @@ impl Trial {
         let (threads, background) = (self.threads, self.request.background);
         let mut judged = Judged {
             sums: setting.quality.sums,
-            off: Deviation::default(),
+            deviation: Deviation::default(),
             own: own.map(|_| Deviation::default()),
             counters: Counters::default(),
             sha256: String::new(),
         };
         for (i, truth) in truths.iter().enumerate() {
-            let way = self.way(setting, truth.view)?;
-            let (picture, counters) = self.draw(setting, &way, truth.view, Cut::on(threads))?;
+            let prepared = self.prepare(setting, truth.view)?;
+            let (picture, counters) =
+                self.draw(setting, &prepared, truth.view, Cut::on(threads))?;
             if i == 0 {
-                judged.sums = way.quality.sums;
+                judged.sums = prepared.quality.sums;
                 (judged.counters, judged.sha256) = (counters, picture.sha256().to_string());
             }
             let width = picture.size[0] as usize;
-            let at = |p: &[u32; 2]| picture.pixels[p[1] as usize * width + p[0] as usize];
-            let got: Vec<_> = truth.sample.iter().map(at).collect();
+            let pixel = |p: &[u32; 2]| picture.pixels[p[1] as usize * width + p[0] as usize];
+            let got: Vec<_> = truth.sample.iter().map(pixel).collect();
             let figures = |want: &Truth| ErrorFigures::compare(&got, &want.limit, background);
-            judged.off = judged.off.with(&figures(truth));
-            judged.own = judged.own.zip(own).map(|(o, own)| o.with(&figures(&own[i])));
+            judged.deviation = judged.deviation.worst(&figures(truth));
+            judged.own = judged.own.zip(own).map(|(o, own)| o.worst(&figures(&own[i])));
         }
         Ok(judged)
     }
 
-    /// Times frames of different views of the path, none of them the first that is drawn.
+    /// Times frames at different views of the path. The first, which fills tables, does not count.
     pub(crate) fn time(&mut self, setting: &Setting, effort: Effort) -> Result<Timing, Fail> {
         let views = self.views();
-        let mut way = self.way(setting, 0)?;
+        let mut prepared = self.prepare(setting, 0)?;
         // Far apart, so that few of them stand for all.
         let order: Vec<usize> = (0..views.max(MOST_FRAMES + 1))
             .map(|i| i % views)
@@ -292,62 +296,62 @@ impl Trial {
         for (n, &i) in order.iter().enumerate().take(MOST_FRAMES + 1) {
             let passed = began.elapsed().as_secs_f64();
             let enough = passed > effort.seconds && ms.len() >= FRAMES;
-            if enough || (passed > LONG && !ms.is_empty()) {
+            if enough || (passed > LONG_S && !ms.is_empty()) {
                 break;
             }
-            if self.grounds[0].1.is_tween() {
-                way = self.way(setting, i)?;
+            if self.scenes_by_kind[0].1.is_tween() {
+                prepared = self.prepare(setting, i)?;
             }
             let start = Instant::now();
-            let picture = self.draw(setting, &way, i, effort.cut)?;
+            let picture = self.draw(setting, &prepared, i, effort.cut)?;
             let took = start.elapsed().as_secs_f64() * 1e3;
             drop(picture);
             // The first fills tables and caches.
-            if n > 0 || took > LONG * 1e3 {
+            if n > 0 || took > LONG_S * 1e3 {
                 ms.push(took);
             }
         }
-        Ok(Timing::of(ms))
+        Ok(Timing::from_ms(ms))
     }
 
-    /// A scene at a setting, with its sums decided.
-    fn way(&mut self, setting: &Setting, view: usize) -> Result<Way, Fail> {
+    /// Returns the scene of a setting, with the arithmetic of its sums decided.
+    fn prepare(&mut self, setting: &Setting, view: usize) -> Result<PreparedScene, Fail> {
         let quality = setting.quality;
         quality.check().map_err(|e| Fail::flag(&e))?;
         let info = self.info.clone();
-        let spec = self.stage(setting)?.spec(view);
+        let spec = self.scenes(setting)?.spec(view);
         let classifier = Classifier::new(&spec.transfer, &info, quality.compositing);
         let sums = classifier.choose_sums(&quality, &info.lattice).map_err(|e| Fail::flag(&e))?;
         let quality = Quality { sums, ..quality };
-        Ok(Way { scene: Arc::new(Scene::new(&SceneSpec { quality, ..spec })), quality })
+        Ok(PreparedScene { scene: Arc::new(Scene::new(&SceneSpec { quality, ..spec })), quality })
     }
 
-    /// A picture of full size.
+    /// Draws one view, magnified to full size.
     fn draw(
         &mut self,
         setting: &Setting,
-        way: &Way,
+        prepared: &PreparedScene,
         view: usize,
         cut: Cut,
     ) -> Result<(Picture, Counters), Fail> {
         let size = self.size();
         let drawn = setting.drawn_size(size).unwrap_or(size);
-        let stage = self.stage(setting)?;
-        let view = stage.view_at_size(view, &way.quality, drawn)?;
-        let frame = Frame::new(way.scene.clone(), view);
-        let (picture, counters) = direct::draw_counted(&frame, &stage.bricks, cut);
+        let scenes = self.scenes(setting)?;
+        let view = scenes.view_at_size(view, &prepared.quality, drawn)?;
+        let frame = Frame::new(prepared.scene.clone(), view);
+        let (picture, counters) = direct::draw_counted(&frame, &scenes.bricks, cut);
         let factor = if drawn == size { 1 } else { setting.shrink };
         Ok((magnified(picture, factor, cut.threads), counters))
     }
 }
 
-/// A scene that is ready at a setting.
-struct Way {
+/// A scene that is ready to be drawn at a setting.
+struct PreparedScene {
     scene: Arc<Scene>,
     quality: Quality,
 }
 
-fn ground(setting: &Setting) -> Ground {
+fn brick_kind(setting: &Setting) -> BrickKind {
     (setting.shaded, setting.quality.compositing == Compositing::Paper)
 }
 
@@ -366,25 +370,26 @@ mod tests {
     }
 
     #[test]
-    fn finer_settings_are_nearer_to_the_truth() {
+    fn finer_settings_have_smaller_errors() {
         let mut trial = trial("skin");
         let mut progress = Progress::new(true);
         let truth = [trial.truth(1, 512, 1, (&mut progress, 0)).unwrap()];
         let base = trial.base;
-        let at = |thickness, shrink| Setting {
+        let setting = |thickness, shrink| Setting {
             quality: Quality { thickness, eps: 0.0, ..base.quality },
             shrink,
             ..base
         };
-        let mut off = |s: Setting| trial.judge(&s, &truth, None).unwrap().off;
-        let (coarse, fine, small) = (off(at(2.0, 1)), off(at(0.5, 1)), off(at(0.5, 2)));
+        let mut deviation = |s: Setting| trial.judge(&s, &truth, None).unwrap().deviation;
+        let (coarse, fine, small) =
+            (deviation(setting(2.0, 1)), deviation(setting(0.5, 1)), deviation(setting(0.5, 2)));
         assert!(fine.rmse < 0.2 && fine.rmse < coarse.rmse / 4.0, "{fine:?} {coarse:?}");
         assert!(small.rmse > 10.0 * fine.rmse && small.rmse < 40.0, "{small:?}");
         assert!(fine.most_999 <= fine.max && fine.pixels > 100);
     }
 
     #[test]
-    fn another_model_has_a_truth_of_its_own() {
+    fn another_model_is_judged_by_its_own_limit_too() {
         let mut trial = trial("skin");
         let mut progress = Progress::new(true);
         let truth = [trial.truth(0, 256, 1, (&mut progress, 0)).unwrap()];
@@ -393,14 +398,14 @@ mod tests {
         let own = [trial.own_truth(&setting, &truth[0]).unwrap()];
         let judged = trial.judge(&setting, &truth, Some(&own)).unwrap();
         let own = judged.own.unwrap();
-        assert!(own.rmse < 1.0 && judged.off.rmse > 5.0, "{own:?} {:?}", judged.off);
+        assert!(own.rmse < 1.0 && judged.deviation.rmse > 5.0, "{own:?} {:?}", judged.deviation);
         let (base, bare) = (trial.base, setting);
         let ((n, bytes), (m, fewer)) = (trial.bricks(&base).unwrap(), trial.bricks(&bare).unwrap());
         assert!(n == m && fewer < bytes, "no normals: {fewer} of {bytes}");
     }
 
     #[test]
-    fn times_are_of_frames() {
+    fn times_are_positive_and_ordered() {
         let mut trial = trial("fog");
         let effort = Effort { cut: Cut::on(1), seconds: 0.0 };
         let base = trial.base;

@@ -1,15 +1,16 @@
-//! The measured half of a prediction: each tile that a schedule may ask for, drawn on one core.
+//! The measured half of a prediction: draws every tile that a schedule may ask for, on one core.
 //!
-//! Every tile of a level is drawn as a worker draws it, from the same bricks and the same state,
-//! several times, and its shortest time on the processor counts: what disturbs a tile (a cache that
-//! another program has filled, a page that is touched for the first time) only ever makes it longer.
+//! Every tile of a level is drawn several times as a worker draws it, from the same bricks and the
+//! same state. Its shortest processor time counts, since disturbances (a cold cache, the first touch
+//! of a page) only ever lengthen it.
 //!
-//! Which bricks lie where a worker finds out once a frame, whatever its tiles: blocks of bricks when it
-//! begins, a block's bricks when one of its tiles first needs them ([`slabcast_render::visibility`]). So a
-//! tile's time is that with its blocks looked at; it names them, and a block's price is measured apart.
-//! Whoever runs the tiles charges a worker each block of a frame once, to the tile that comes first.
+//! A worker projects bricks once a frame: blocks of bricks when the frame begins, the bricks of a
+//! block when a tile first needs them ([`slabcast_render::visibility`]). So the time of a tile is
+//! measured with its blocks projected. The tile lists them, and the time of a block is measured
+//! apart. The simulation charges each block of a frame once to a worker, with its first tile.
 //!
-//! A tile of one part is drawn once more, to see when it comes to each of its bricks: who lacks one draws as far as that.
+//! A tile of one part is drawn once more to record when it needs each brick: a worker that lacks the
+//! brick draws up to that point.
 
 use super::clock::cpu_ns;
 use prost::Message;
@@ -49,40 +50,43 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// What is measured.
-pub(crate) struct Path<'a> {
-    pub(crate) stage: &'a PathScenes,
+/// Arguments of [`measure`].
+pub(crate) struct MeasureArgs<'a> {
+    pub(crate) scenes: &'a PathScenes,
+    /// Number of frames of the path.
     pub(crate) frames: usize,
     pub(crate) work: Work,
-    /// Numbers of tiles that schedules will want: they decide which levels are drawn.
+    /// Numbers of tiles that schedules will want, which decide the levels to draw.
     pub(crate) wanted: Vec<u64>,
-    /// Edges that are drawn whatever schedules will want.
+    /// Edges in pixels that are drawn in any case.
     pub(crate) edges: Vec<u32>,
-    /// For which schedules.
+    /// Whether to draw the tiles of the slab schedule.
     pub(crate) slab: bool,
+    /// Whether to draw the tiles of the region schedule.
     pub(crate) region: bool,
+    /// Times each tile is drawn.
     pub(crate) repeats: u32,
-    /// What messages take here, where it is known.
+    /// Processor time of messages here, if it could be measured.
     pub(crate) pings: Option<Pings>,
+    /// Names of the volume and of the transfer function.
     pub(crate) names: (String, String),
 }
 
-/// What a plain `slabcast render` has tiles finished to, over the usual background: others weigh about the
-/// same.
+/// Encoding of finished tiles in a plain `slabcast render`; others have about as many bytes.
 pub(crate) const FINISH: PixelEncoding =
     PixelEncoding { format: PixelFormat::Rgb8, background: Background::Colour([0.0; 3]) };
 
-/// The path's frames as the scheduler gets them.
-pub(crate) fn jobs(stage: &PathScenes, frames: usize, work: Work) -> Result<Vec<FrameJob>, Fail> {
-    let bricks = stage.bricks.directory().bricks();
-    let mut scene = Arc::new(stage.spec(0));
+/// Returns the frames of the path as jobs of the scheduler.
+pub(crate) fn jobs(scenes: &PathScenes, frames: usize, work: Work) -> Result<Vec<FrameJob>, Fail> {
+    let bricks = scenes.bricks.directory().bricks();
+    let mut scene = Arc::new(scenes.spec(0));
     (0..frames)
         .map(|i| {
-            let spec = stage.spec(i);
+            let spec = scenes.spec(i);
             if spec != *scene {
                 scene = Arc::new(spec);
             }
-            let view = stage.view(i, &scene.quality)?;
+            let view = scenes.view(i, &scene.quality)?;
             let (frame, number) = (FrameId(i as u64 + 1), i as u64);
             let (scene, bricks) = (scene.clone(), bricks.clone());
             Ok(FrameJob { frame, number, scene, bricks, view, work, finish: Some(FINISH) })
@@ -90,18 +94,18 @@ pub(crate) fn jobs(stage: &PathScenes, frames: usize, work: Work) -> Result<Vec<
         .collect()
 }
 
-/// Draws the tiles. `progress` counts frames; so many were done before. Who is told to stop has fewer
-/// frames in the trace than were asked for.
+/// Draws the tiles. Counts frames in `progress`, on from the `before` frames done. After Ctrl-C the
+/// trace has fewer frames than requested.
 pub(crate) fn measure(
-    path: &Path<'_>,
+    path: &MeasureArgs<'_>,
     (progress, before): (&mut Progress, usize),
 ) -> Result<Trace, Fail> {
-    let jobs = jobs(path.stage, path.frames, path.work)?;
+    let jobs = jobs(path.scenes, path.frames, path.work)?;
     let depths = ClosingDepths::new(jobs[0].view.size);
     let packing = Packed::default();
     let mut bench = Bench { scratch: Scratch::default(), repeats: path.repeats, depths, packing };
     let mut frames = Vec::with_capacity(jobs.len());
-    // What a worker has after its first frame: footprints in the scene, memory that has grown.
+    // Warms up, as a worker is after its first frame: footprints in the scene, memory allocated.
     bench.frame(path, 0, &jobs[0])?;
     bench.depths = ClosingDepths::new(jobs[0].view.size);
     for (i, job) in jobs.iter().enumerate() {
@@ -129,13 +133,13 @@ pub(crate) fn measure(
 struct Bench {
     scratch: Scratch,
     repeats: u32,
-    /// How deep the frame before was open.
+    /// Closing depths of the frame before.
     depths: ClosingDepths,
-    /// What packing took of the tiles so far.
+    /// Compression of the tiles so far.
     packing: Packed,
 }
 
-/// Finished pixels that were packed and unpacked.
+/// Total bytes and times of compressing and decompressing finished pixels.
 #[derive(Default)]
 struct Packed {
     bytes: u64,
@@ -149,10 +153,10 @@ impl Packed {
         Packing { pack_ns: mean(self.pack_ns), unpack_ns: mean(self.unpack_ns) }
     }
 
-    /// Bytes of a result of finished pixels as it crosses, packed and as it is; what packing takes counts.
+    /// Returns the bytes of a result message, compressed and plain, and adds the times of compression.
     fn weigh(&mut self, repeats: u32, leaves: SparseTile, counters: Counters) -> [u32; 2] {
         self.bytes += leaves.data.len() as u64;
-        let result = result_of(Pixels::Finished(leaves), counters);
+        let result = result_message(Pixels::Finished(leaves), counters);
         let [packed, plain] = [true, false].map(|packs| {
             let compression = if packs { Compression::Lz4 } else { Compression::None };
             let to_wire = || convert::from_worker_to_wire_as(&result, compression);
@@ -166,7 +170,7 @@ impl Packed {
     }
 }
 
-/// The shortest of some runs, in nanoseconds, and what the last one gave.
+/// Returns the shortest processor time of some runs, in ns, and the result of the last.
 fn shortest<T>(repeats: u32, mut run: impl FnMut() -> T) -> (u64, T) {
     let mut timed = || {
         let began = cpu_ns();
@@ -181,9 +185,9 @@ fn shortest<T>(repeats: u32, mut run: impl FnMut() -> T) -> (u64, T) {
     (best, last)
 }
 
-/// The shortest time of each tile, in nanoseconds, where all are drawn in turn so many times: what one needs has left the
-/// caches when it is drawn again, as it has in a worker. One that is drawn again at once finds it there if it is small, so
-/// that small tiles look cheaper than they are.
+/// Returns the shortest processor time of each tile, in ns, with all tiles drawn in turn. A tile's
+/// data has then left the caches before it is drawn again, as in a worker; small tiles drawn again
+/// at once would look cheaper than they are.
 fn in_turn(repeats: u32, tiles: &[Rect], mut draw: impl FnMut(Rect)) -> Vec<u64> {
     let mut best = vec![u64::MAX; tiles.len()];
     for _ in 0..repeats.max(1) {
@@ -197,8 +201,13 @@ fn in_turn(repeats: u32, tiles: &[Rect], mut draw: impl FnMut(Rect)) -> Vec<u64>
 }
 
 impl Bench {
-    fn frame(&mut self, path: &Path<'_>, i: usize, job: &FrameJob) -> Result<FrameTrace, Fail> {
-        let scene = path.stage.scene(i);
+    fn frame(
+        &mut self,
+        path: &MeasureArgs<'_>,
+        i: usize,
+        job: &FrameJob,
+    ) -> Result<FrameTrace, Fail> {
+        let scene = path.scenes.scene(i);
         let (setup_ns, frame) = shortest(self.repeats, || Frame::new(scene.clone(), job.view));
         let looked = self.look(path, &frame);
         let (alone_edge, alone_ns) = self.alone(path, &frame, &looked);
@@ -244,10 +253,10 @@ impl Bench {
         })
     }
 
-    /// All levels that may be wanted of a slab; the pixels are those of the first.
+    /// Draws all levels that may be wanted of a slab. The pixels are those of the first level.
     fn slab(
         &mut self,
-        path: &Path<'_>,
+        path: &MeasureArgs<'_>,
         job: &FrameJob,
         frame: &Frame,
         projected: &[Option<Projected>],
@@ -284,7 +293,7 @@ impl Bench {
                 let over = |r: &Rect| !r.intersect(&t.rect).is_empty();
                 let places = needed.iter().zip(&rects).filter(|(_, r)| over(r));
                 let bricks: Vec<Arc<Brick>> =
-                    places.map(|(&i, _)| path.stage.bricks[i].clone()).collect();
+                    places.map(|(&i, _)| path.scenes.bricks[i].clone()).collect();
                 let before = state.tile_state(t.rect);
                 let (simd, scratch) = (Simd::detect(), &mut self.scratch);
                 let (ns, (pixels, counters)) = shortest(self.repeats, || {
@@ -299,8 +308,8 @@ impl Bench {
                     bricks: bricks.iter().map(|b| b.id).collect(),
                     state: before,
                 };
-                let lease_bytes = lease_weighs(lease);
-                let (result_bytes, result) = weigh(Pixels::Sums(pixels), counters);
+                let lease_bytes = lease_bytes(lease);
+                let (result_bytes, result) = result_bytes(Pixels::Sums(pixels), counters);
                 let Pixels::Sums(pixels) = result else { unreachable!("given above") };
                 let (x, y) = (t.rect.x0 as u32, t.rect.y0 as u32);
                 tiles.push(TileTrace { x, y, ns, lease_bytes, result_bytes });
@@ -314,9 +323,9 @@ impl Bench {
         (levels, first)
     }
 
-    /// What it takes to look at the directory, and at a block of it.
-    fn look(&mut self, path: &Path<'_>, frame: &Frame) -> Looked {
-        let directory = path.stage.bricks.directory();
+    /// Measures the projection of the directory, and of a block of it.
+    fn look(&mut self, path: &MeasureArgs<'_>, frame: &Frame) -> ProjectionTimes {
+        let directory = path.scenes.bricks.directory();
         let (outlook_ns, _) = shortest(self.repeats, || VisibleBricks::new(&frame.view, directory));
         let mut block_ns = u64::MAX;
         for _ in 0..self.repeats {
@@ -326,13 +335,13 @@ impl Bench {
             (0..blocks).for_each(|block| outlook.project_block(block));
             block_ns = block_ns.min((cpu_ns() - began) / u64::from(blocks.max(1)));
         }
-        Looked { outlook_ns, block_ns }
+        ProjectionTimes { outlook_ns, block_ns }
     }
 
-    /// Tiles through all depths.
+    /// Draws the tiles of the region schedule, which reach through all depths.
     fn regions(
         &mut self,
-        path: &Path<'_>,
+        path: &MeasureArgs<'_>,
         job: &FrameJob,
         frame: &Frame,
         projected: &[Option<Projected>],
@@ -341,13 +350,13 @@ impl Bench {
             return Vec::new();
         }
         let size = job.view.size;
-        let bricks = &path.stage.bricks;
+        let bricks = &path.scenes.bricks;
         let rects: Vec<Rect> = projected.iter().flatten().map(|p| p.rect).collect();
-        // The schedule goes by blocks of bricks, whose outline is a little larger: it may take the level
-        // beside the one that bricks alone say. And a frame beside others may be one of two crews'.
-        // Of a frame that is alone it cuts some tiles of 64 pixels in parts of 32.
+        // The schedule uses blocks of bricks, whose outline is a little larger, so that it may choose
+        // the level next to the one for bricks. Overlapping frames may each have half the workers,
+        // and a sole frame has some tiles of 64 pixels cut in parts of 32.
         let mut edges: BTreeSet<u32> = match job.work.tile {
-            // What says when a large tile comes to its bricks are its parts.
+            // The parts of a large tile record when it needs its bricks.
             Some(edge) => [edge, edge.min(PART_EDGE as u32)].into(),
             None => [32, 64, 128, 256].into(),
         };
@@ -379,13 +388,13 @@ impl Bench {
                     self.packing.weigh(self.repeats, leaves, counters);
                 let (x, y) = (t.rect.x0 as u32, t.rect.y0 as u32);
                 let opened = outlook.projected_blocks().collect();
-                // Blocks that only this opens are opened by the way.
+                // Comes after `opened`, since it may project more blocks.
                 let expected =
                     region::expected_bricks(frame, &outlook, &Nothing, t.rect, &self.depths);
                 let tile = RegionTile { x, y, touched, opened, expected, ..RegionTile::default() };
                 tiles.push(RegionTile { result_bytes, plain_bytes, ..tile });
             }
-            // All blocks that any needs are open then, as the price of one is told apart.
+            // All blocks are projected before timing, since their time is measured apart.
             let outlook = VisibleBricks::new(&frame.view, bricks.directory());
             let opened = tiles.iter().flat_map(|t| &t.opened);
             opened.for_each(|block| outlook.project_block(*block));
@@ -406,9 +415,14 @@ impl Bench {
         levels
     }
 
-    /// The best cut of one core through all depths: edge and time, looks at blocks included.
-    fn alone(&mut self, path: &Path<'_>, frame: &Frame, looked: &Looked) -> (u32, u64) {
-        let bricks = &path.stage.bricks;
+    /// Returns edge and ns of the fastest tiles for one core, projection of blocks included.
+    fn alone(
+        &mut self,
+        path: &MeasureArgs<'_>,
+        frame: &Frame,
+        looked: &ProjectionTimes,
+    ) -> (u32, u64) {
+        let bricks = &path.scenes.bricks;
         let whole = Rect::from_size(frame.view.size);
         let simd = Simd::detect();
         let repeats = self.repeats;
@@ -420,7 +434,7 @@ impl Bench {
             let mut draw = |tile| {
                 region::draw(frame, &outlook, bricks, simd, tile, &mut self.scratch, &mut pixels);
             };
-            // The first time opens blocks; later ones count.
+            // The first run projects the blocks and does not count.
             tiles.iter().for_each(|tile| draw(*tile));
             let times = in_turn(repeats, &tiles, draw);
             times.iter().sum::<u64>() + outlook.projected_blocks().count() as u64 * looked.block_ns
@@ -431,7 +445,7 @@ impl Bench {
     }
 }
 
-/// No bricks.
+/// A supply without bricks.
 struct Nothing;
 
 impl BrickSupply for Nothing {
@@ -440,7 +454,7 @@ impl BrickSupply for Nothing {
     }
 }
 
-/// Bricks, and when each was first asked for.
+/// A supply that records when each brick was first requested.
 struct Clocked<'a> {
     bricks: &'a dyn BrickSupply,
     began: Instant,
@@ -452,7 +466,7 @@ impl<'a> Clocked<'a> {
         Clocked { bricks, began: Instant::now(), came: RefCell::default() }
     }
 
-    /// When that was for each of these, in thousandths of the time until now.
+    /// Returns the time of the first request of each brick, in thousandths of the time until now.
     fn needed(&self, touched: &[u32]) -> Vec<u16> {
         let (all, came) = (self.began.elapsed().as_secs_f64().max(1e-9), self.came.borrow());
         let of = |place| came.get(place).map_or(0.0, Duration::as_secs_f64) / all;
@@ -467,26 +481,26 @@ impl BrickSupply for Clocked<'_> {
     }
 }
 
-/// What it takes to look at bricks, in nanoseconds.
-struct Looked {
-    /// At all blocks.
+/// Processor time of projecting bricks, in ns.
+struct ProjectionTimes {
+    /// Time for all blocks of the directory.
     outlook_ns: u64,
-    /// At the bricks of one block, on the average.
+    /// Mean time for the bricks of one block.
     block_ns: u64,
 }
 
-/// Bytes of a lease as it crosses.
-fn lease_weighs(lease: Lease) -> u32 {
+/// Returns the bytes of a lease message.
+fn lease_bytes(lease: Lease) -> u32 {
     match convert::to_worker_to_wire(&ToWorker::Lease(Box::new(lease)), 0) {
         Down::Control(message) => message.encoded_len() as u32,
-        Down::Parts(_) | Down::Bricks(_) => unreachable!("a lease goes on Control"),
+        Down::Parts(_) | Down::Bricks(_) => unreachable!("a lease is sent on Control"),
     }
 }
 
-/// A result as it is sent, but for what a region tells of its bricks.
-fn result_of(pixels: Pixels, counters: Counters) -> ToMaster {
+/// Returns a result message without the brick report of a region.
+fn result_message(pixels: Pixels, counters: Counters) -> ToMaster {
     let (task, epoch) = (TaskId(1 << 12), Epoch(0));
-    // Times as they are after some hours: five bytes each.
+    // Times after some hours: five bytes each on the wire.
     let us = 1 << 33;
     let times = TaskTimes { received_us: us, ready_us: us, start_us: us, end_us: us, thread: 0 };
     let (bytes, region) = (None, None);
@@ -494,15 +508,18 @@ fn result_of(pixels: Pixels, counters: Counters) -> ToMaster {
     ToMaster::Result(Box::new(result))
 }
 
-/// Bytes of a result as it crosses.
-fn weigh(pixels: Pixels, counters: Counters) -> (u32, Pixels) {
-    let result = result_of(pixels, counters);
+/// Returns the bytes of a result message, and its pixels.
+fn result_bytes(pixels: Pixels, counters: Counters) -> (u32, Pixels) {
+    let result = result_message(pixels, counters);
     let bytes = convert::from_worker_to_wire(&result).encoded_len();
     let ToMaster::Result(result) = result else { unreachable!("made above") };
     (bytes as u32, result.pixels)
 }
 
-/// Whether a trace is of this path, frame by frame.
+/// Checks that a trace is of this path, frame by frame.
+///
+/// # Errors
+/// The number of frames or one of the views differs.
 pub(crate) fn fits(trace: &Trace, jobs: &[FrameJob]) -> Result<(), String> {
     if trace.frames.len() != jobs.len() {
         return Err(format!(
@@ -549,7 +566,7 @@ mod tests {
         let turn = Turntable { frames: 4, step: 22.5, ..Turntable::default() };
         let request = RenderRequest::for_preset(ViewPath::from_turntable([512, 512], turn), tf)
             .expect("a request");
-        Some(PathScenes::new(&volume, &info, &request, orientation).expect("a stage"))
+        Some(PathScenes::new(&volume, &info, &request, orientation).expect("a scenes"))
     }
 
     /// Bytes of a frame's results and what a tile takes to write and to read, for docs/scaling.md.
@@ -561,11 +578,11 @@ mod tests {
         );
         println!("packed and written, noise written, read. ms a frame: composed");
         for scene in OPAQUE {
-            let Some(stage) = staged(scene) else { continue };
+            let Some(scenes) = staged(scene) else { continue };
             let (mut bytes, mut ns, mut composed, mut tiles) = ([0; 3], [0; 6], 0, 0);
             for i in 0..4 {
-                let frame = stage.frame(i).expect("a frame");
-                let picture = direct::draw(&frame, &stage.bricks, Cut::on(2));
+                let frame = scenes.frame(i).expect("a frame");
+                let picture = direct::draw(&frame, &scenes.bricks, Cut::on(2));
                 let mut state = FrameState::new([512, 512]);
                 for (rect, sums) in tiles_of(&picture.pixels) {
                     tiles += 1;
@@ -639,9 +656,9 @@ mod tests {
         );
         let [mri, others @ ..] = OPAQUE;
         for scene in [mri, (mri.0, mri.1, "peer-semi")].into_iter().chain(others) {
-            let Some(stage) = staged(scene) else { continue };
-            let frame = stage.frame(1).expect("a frame");
-            let bricks = &stage.bricks;
+            let Some(scenes) = staged(scene) else { continue };
+            let frame = scenes.frame(1).expect("a frame");
+            let bricks = &scenes.bricks;
             let (ns, n) = shortest(9, || {
                 let seen: Vec<ProjectedBrick> =
                     bricks.iter().filter_map(|b| ProjectedBrick::new(&frame, b)).collect();
@@ -699,15 +716,15 @@ mod tests {
         const MESSAGE: usize = 64 << 10;
         println!("bytes a voxel and a brick; of them packed, %, and us a brick to pack and unpack");
         for scene in OPAQUE {
-            let Some(stage) = staged(scene) else { continue };
+            let Some(scenes) = staged(scene) else { continue };
             let encoded = |brick: &Arc<Brick>| {
                 let mut bytes = Vec::new();
                 brick.encode(&mut bytes);
                 bytes
             };
-            let bricks: Vec<Vec<u8>> = stage.bricks.iter().map(encoded).collect();
+            let bricks: Vec<Vec<u8>> = scenes.bricks.iter().map(encoded).collect();
             let voxels: u32 =
-                stage.bricks.directory().bricks().iter().map(|b| u32::from(b.voxels)).sum();
+                scenes.bricks.directory().bricks().iter().map(|b| u32::from(b.voxels)).sum();
             let all: usize = bricks.iter().map(Vec::len).sum();
             let each = all / bricks.len();
             println!("{}: {:.2}, {each}", scene.2, all as f64 / f64::from(voxels));

@@ -1,9 +1,10 @@
-//! `slabcast lab plan`: what a cluster would do that is not there.
+//! `slabcast lab plan`: predicts the frame times of a cluster that does not exist yet.
 //!
-//! Two halves, and it says which is which: [`measure`] draws every tile of the path here, on one
-//! core, and weighs its messages; [`predict`] runs the scheduler itself with these tiles against
-//! virtual workers and links (`slabcast_sim`). [`costs`] has what messages cost a
-//! processor, as [`pings`] were measured here, [`chart`] draws. [`rehearse`] puts it to the test with processes on this machine.
+//! Its two halves are kept apart in the output. [`measure`] draws every tile of the path here, on
+//! one core, and sizes its messages. [`predict`] runs the scheduler itself with these tiles against
+//! virtual workers and links (`slabcast_sim`). [`costs`] has the processor time of messages, from
+//! the [`pings`] measured here. [`chart`] draws the prediction. [`rehearse`] tests it with real
+//! processes on this machine.
 
 mod chart;
 pub(crate) mod clock;
@@ -14,8 +15,8 @@ pub(crate) mod predict;
 mod rehearse;
 
 use crate::chart::{LIGHT, save};
-use predict::{IN_FLIGHT, LOSSES, Question, Row, STEADILY};
-use rehearse::Over;
+use predict::{IN_FLIGHT, LEAST_STEADY_FRAMES, LOSSES, Question, Row};
+use rehearse::Network;
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_schedule::FrameJob;
 use slabcast_session::fail::{Fail, say};
@@ -32,16 +33,16 @@ use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// What a stream gets through of a link's nominal rate: heads of Ethernet, IP, TCP, HTTP/2. 118 MB/s
-/// were measured on an emulated link of 1 Gbit/s (TRANSPORT.md, answer 7).
+/// Share of a link's nominal rate that is left for payload after the headers of Ethernet, IP, TCP
+/// and HTTP/2. 118 MB/s were measured on an emulated link of 1 Gbit/s (TRANSPORT.md, answer 7).
 pub(crate) const GOODPUT: f64 = 0.94;
 
 /// Predicts frame times of a cluster before it is there.
 ///
-/// And its efficiency and bytes.
+/// Also predicts its efficiency and the bytes it sends.
 ///
-/// The path's tiles are drawn here once, on one core, and timed; then the scheduler itself runs with
-/// them against virtual workers and links. The table says what was measured and what is predicted.
+/// First the tiles of the path are drawn and timed here, on one core. Then the scheduler itself runs
+/// with these times against virtual workers and links. The table separates measured from predicted.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -56,44 +57,44 @@ pub struct PlanArgs {
     of: VolumeSceneArgs,
     #[command(flatten)]
     work: WorkArgs,
-    /// Workers: numbers and ranges, as 1..64 or 1,2,4,8
+    /// Numbers of workers: a list or ranges, such as 1..64 or 1,2,4,8
     #[arg(long, value_name = "LIST", default_value = "1,2,4,8,16,32,64",
           value_parser = parse::workers, help_heading = "Cluster")]
     workers: parse::Workers,
-    /// Render threads of each worker, with a core each
+    /// Render threads of each worker, one core each
     #[arg(long, value_name = "N", default_value = "1", help_heading = "Cluster",
           value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: u32,
-    /// Every machine's link, the master's too: 1gbit, 10gbit, 100mbit or unlimited
+    /// Link of every machine, master included: 1gbit, 10gbit, 100mbit or unlimited
     #[arg(long, value_name = "RATE", default_value = "1gbit", value_parser = parse::link,
           help_heading = "Cluster")]
     link: parse::Rate,
-    /// From one machine to another, one way
+    /// One-way latency between machines
     #[arg(long, value_name = "TIME", default_value = "50us", value_parser = parse::latency,
           help_heading = "Cluster")]
     latency: u64,
-    /// Times that each tile is drawn; its shortest time counts
+    /// Times each tile is drawn; the shortest time counts
     #[arg(long, value_name = "N", default_value = "3", help_heading = "Measuring",
           value_parser = clap::value_parser!(u32).range(1..=100))]
     repeats: u32,
-    /// Take what messages cost on a known machine instead of measuring it
+    /// Use the message costs of a known machine instead of measuring them
     #[arg(long, hide = true)]
     no_pings: bool,
-    /// Tiles that were measured before; where the file is not there yet, it is written
+    /// Trace of measured tiles; read if the file exists, else written
     #[arg(long, value_name = "FILE", help_heading = "Measuring")]
     trace: Option<PathBuf>,
-    /// Then see: start a master and so many workers as processes here, which hold tiles for their
-    /// times, and compare (needs --trace)
+    /// Compare with real processes: starts a master and this many workers here, which hold each tile
+    /// for its measured time (needs --trace)
     #[arg(long, value_name = "LIST", value_parser = parse::workers, requires = "trace",
           help_heading = "Measuring")]
     rehearse: Option<parse::Workers>,
-    /// Where the rehearsal's master listens, for whoever reaches it: an address of this machine that
-    /// workers reach over a link of --link's rate, as docs/shaped.sh makes one [default: 127.0.0.1,
-    /// without a limit]
+    /// Address at which the rehearsal's master listens, open to anyone who reaches it: one that
+    /// workers reach over a link of --link's rate, such as docs/shaped.sh makes [default: 127.0.0.1,
+    /// unlimited]
     #[arg(long, value_name = "ADDRESS", requires = "rehearse", help_heading = "Measuring")]
     rehearse_at: Option<IpAddr>,
-    /// What the rehearsal's workers are started by, such as `ip netns exec far`: words that this
-    /// program and its arguments are put behind
+    /// Command that starts the rehearsal's workers, such as `ip netns exec far`; this program and its
+    /// arguments are appended
     #[arg(long, value_name = "COMMAND", requires = "rehearse_at", help_heading = "Measuring")]
     rehearse_by: Option<String>,
     /// Folder for plan.svg, plan.png, plan.json and plan.csv
@@ -107,10 +108,15 @@ pub struct PlanArgs {
     quiet: bool,
 }
 
-/// Runs the command.
+/// Runs `slabcast lab plan`: measures or reads the tiles, and prints the prediction as a table or as
+/// JSON; with `--output` also writes chart and tables.
+///
+/// # Errors
+/// The arguments or the volume are refused, the trace is of another path, a rehearsal fails, or a
+/// file can't be read or written.
 pub fn run(args: &PlanArgs) -> Result<(), Fail> {
     let work = args.work.work()?;
-    // Whoever leaves it to the master sees what there is to choose from.
+    // With `auto`, both schedules are shown.
     let schedules = match work.schedule {
         Schedule::Auto => vec![Schedule::Region, Schedule::Slab],
         one => vec![one],
@@ -139,7 +145,7 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
         }
     }
     let mut progress = Progress::new(args.quiet);
-    // Refused before minutes of measuring; what is made goes again if nothing comes into it.
+    // Checked before minutes of measuring; the folder is removed again if it stays empty.
     let _made = args.output.as_deref().map(OutputFolder::new).transpose()?;
     if let Some(file) = args.trace.as_deref().filter(|file| !file.exists()) {
         probe(file)?;
@@ -147,10 +153,10 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
     let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
     progress.phase("cutting the volume into bricks");
     let names = (volume.name.clone(), request.transfer.name().to_string());
-    let stage = PathScenes::new(&volume, &info, &request, orientation)?;
+    let scenes = PathScenes::new(&volume, &info, &request, orientation)?;
     drop(volume);
     let frames = request.path.frames();
-    let jobs = measure::jobs(&stage, frames, work)?;
+    let jobs = measure::jobs(&scenes, frames, work)?;
     let more = args.rehearse.iter().flat_map(|list| &list.0);
     let wanted = workers.iter().chain(more).map(|n| {
         let threads = f64::from(*n) * f64::from(args.threads);
@@ -158,7 +164,7 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
     });
     let measured = match &args.trace {
         Some(file) if file.exists() => {
-            let trace = read(file)?;
+            let trace = read_trace(file)?;
             measure::fits(&trace, &jobs)
                 .map_err(|e| Fail::failed(format!("{}: {e}", file.display())))?;
             Measured { trace, now: false }
@@ -173,8 +179,8 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
             };
             let pinging = began.elapsed();
             progress.frames(frames as u64, &format!("drawing the tiles of {frames} frames"));
-            let path = measure::Path {
-                stage: &stage,
+            let measure_args = measure::MeasureArgs {
+                scenes: &scenes,
                 frames,
                 work,
                 wanted: wanted.collect(),
@@ -186,8 +192,8 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
                 names,
             };
             let began = Instant::now();
-            let mut trace = measure::measure(&path, (&mut progress, 0))?;
-            // Once more, unless that would be at once; who could not tell before is not asked again.
+            let mut trace = measure::measure(&measure_args, (&mut progress, 0))?;
+            // Pinging again some time later evens out disturbances; useless at once or after a failure.
             let later = began.elapsed() > pinging;
             if let Some(before) = pings.filter(|_| later && !signals::stop_requested()) {
                 progress.phase("measuring what messages take");
@@ -201,7 +207,7 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
         }
     };
     progress.end();
-    drop(stage);
+    drop(scenes);
     let link = Link {
         bytes_per_s: args.link.0.map(|bits| bits / 8.0 * GOODPUT),
         latency_ns: args.latency,
@@ -211,16 +217,16 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
     let threads = machine::cores() as usize;
     let mut predicted = Vec::new();
     for schedule in schedules {
-        let under = |job: &FrameJob| Work { schedule, ..job.work };
+        let work = |job: &FrameJob| Work { schedule, ..job.work };
         let jobs: Vec<FrameJob> =
-            jobs.iter().map(|job| FrameJob { work: under(job), ..job.clone() }).collect();
+            jobs.iter().map(|job| FrameJob { work: work(job), ..job.clone() }).collect();
         let trace = &measured.trace;
         let costs = costs::messages(trace, schedule);
         let rehearsed = match (&args.rehearse, &args.trace) {
             (Some(list), Some(file)) => {
                 let mut request: RenderRequest = request.clone();
                 request.work.schedule = schedule;
-                let stage = rehearse::PathScenes {
+                let rehearsals = rehearse::Rehearsals {
                     volume: &args.of.volume,
                     file,
                     trace,
@@ -229,13 +235,15 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
                     axes: &args.of.scene.view.axes,
                     threads: args.threads,
                     costs,
-                    over: match args.rehearse_at {
-                        Some(at) => Over { at, by: args.rehearse_by.as_deref(), link },
-                        None => Over::LOOPBACK,
+                    network: match args.rehearse_at {
+                        Some(listen) => {
+                            Network { listen, worker_launcher: args.rehearse_by.as_deref(), link }
+                        }
+                        None => Network::LOOPBACK,
                     },
                 };
                 let mut progress = Progress::new(args.quiet);
-                let rehearsed = stage.run(&list.0, &mut progress);
+                let rehearsed = rehearsals.run(&list.0, &mut progress);
                 progress.end();
                 rehearsed?
             }
@@ -243,55 +251,62 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
         };
         let rows = predict::rows(&jobs, trace, workers, &question, costs, threads)?;
         let orders = match schedule {
-            // Of a cluster whose tiles are of 64 pixels, as the paper's are.
+            // At most 8 workers: their tiles are of 64 pixels, as in the paper.
             Schedule::Region => predict::orders(&jobs, trace, most.min(8))?,
             Schedule::Slab | Schedule::Auto => None,
         };
         predicted.push(Predicted { schedule, rows, rehearsed, orders });
     }
-    let said = Said { args, frames, measured: &measured, predicted: &predicted };
+    let output = PlanOutput { args, frames, measured: &measured, predicted: &predicted };
     if let Some(dir) = &args.output {
-        said.write(dir)?;
+        output.write(dir)?;
     }
-    say(&if args.json { format!("{}\n", said.json()) } else { said.table() })
+    say(&if args.json { format!("{}\n", output.json()) } else { output.table() })
 }
 
-/// What messages take here; who can't tell is warned.
+/// Measures the processor time of messages here; warns and returns `None` if that fails.
 pub(crate) fn pinged() -> Option<Pings> {
-    let told = pings::measure();
-    told.inspect_err(|why| {
-        warn(&format!(
-            "what messages take can't be measured here ({why}): theirs on another machine count"
-        ))
-    })
-    .ok()
+    let measured = pings::measure();
+    measured
+        .inspect_err(|why| {
+            warn(&format!(
+                "message costs can't be measured here ({why}); using those of a known machine"
+            ))
+        })
+        .ok()
 }
 
-/// Reads a trace.
-pub fn read(file: &Path) -> Result<Trace, Fail> {
+/// Reads a trace of measured tiles from a JSON file, as `--trace` writes it.
+///
+/// # Errors
+/// The file can't be read, is larger than any trace, or is no valid trace of this version.
+pub fn read_trace(file: &Path) -> Result<Trace, Fail> {
     let mut bytes = Vec::new();
     std::fs::File::open(file)
         .and_then(|f| f.take(MAX_BYTES + 1).read_to_end(&mut bytes))
         .map_err(|e| Fail::io(file, "reading", &e))?;
     if bytes.len() as u64 > MAX_BYTES {
-        return Err(Fail::failed(format!("{}: is larger than a trace", file.display())));
+        return Err(Fail::failed(format!(
+            "{}: is larger than a trace; give a file that --trace wrote",
+            file.display()
+        )));
     }
     Trace::from_json(&bytes).map_err(|e| Fail::failed(format!("{}: {e}", file.display())))
 }
 
-/// The measured half.
+/// The measured half: tiles and how they were obtained.
 struct Measured {
     trace: Trace,
-    /// Whether it was measured by this command.
+    /// True if this command measured them, false if it read them from a file.
     now: bool,
 }
 
-/// What is predicted of a schedule.
+/// Predictions for one schedule.
 struct Predicted {
     schedule: Schedule,
     rows: Vec<Row>,
     rehearsed: Vec<rehearse::Rehearsed>,
-    /// How well tiles' estimates tell the order of their times: plainly, and learned.
+    /// Rank correlation of estimated and measured tile times: by bricks, by earlier views.
     orders: Option<[f64; 2]>,
 }
 
@@ -304,8 +319,8 @@ impl Predicted {
     }
 }
 
-/// What messages take, in a line.
-fn said_of(pings: Option<&Pings>) -> String {
+/// Returns a line about the processor time of messages.
+fn pings_line(pings: Option<&Pings>) -> String {
     let Some(Pings { alone_ns, company_ns }) = pings else {
         return "messages: not measured here; those of an EPYC of 2.45 GHz".into();
     };
@@ -319,10 +334,10 @@ fn said_of(pings: Option<&Pings>) -> String {
     )
 }
 
-/// Where the render threads' time goes; nothing where paths are too short to tell.
-fn losses(name: &str, rows: &[Row]) -> String {
-    let told: Vec<_> = rows.iter().filter_map(|r| Some((r, r.steady.as_ref()?))).collect();
-    if told.is_empty() {
+/// Returns a table of where the render threads' time goes; empty if the path is too short.
+fn losses_table(name: &str, rows: &[Row]) -> String {
+    let steady_rows: Vec<_> = rows.iter().filter_map(|r| Some((r, r.steady.as_ref()?))).collect();
+    if steady_rows.is_empty() {
         return String::new();
     }
     let mut text = format!("\n{name} schedule, four in flight: % of the render threads' time\n");
@@ -331,7 +346,7 @@ fn losses(name: &str, rows: &[Row]) -> String {
         let _ = write!(text, " {name:>8}");
     }
     let _ = writeln!(text, " | {:>6} {:>7} {:>8}", "driver", "streams", "decides");
-    for (r, steady) in told {
+    for (r, steady) in steady_rows {
         let alone = r.throughput.map_or(0.0, |t| t.1);
         let _ = write!(text, "{:>7} {:>8.1}", r.workers, 100.0 * alone);
         for part in steady.lost {
@@ -344,15 +359,15 @@ fn losses(name: &str, rows: &[Row]) -> String {
     text
 }
 
-/// All that is said.
-struct Said<'a> {
+/// The prediction, ready to be printed and written.
+struct PlanOutput<'a> {
     args: &'a PlanArgs,
     frames: usize,
     measured: &'a Measured,
     predicted: &'a [Predicted],
 }
 
-impl Said<'_> {
+impl PlanOutput<'_> {
     fn tiles(&self) -> usize {
         let frames = &self.measured.trace.frames;
         let slabs = frames.iter().flat_map(|f| &f.slabs).flat_map(|s| &s.levels);
@@ -389,7 +404,7 @@ impl Said<'_> {
             self.tiles(),
             trace.about.repeats,
             one_core_ms(trace),
-            said_of(trace.about.pings.as_ref()),
+            pings_line(trace.about.pings.as_ref()),
         );
         for p in self.predicted {
             let slabs = match p.schedule {
@@ -429,16 +444,17 @@ impl Said<'_> {
             }
         }
         if self.predicted.iter().flat_map(|p| &p.rows).any(|r| r.throughput.is_none()) {
-            let least = STEADILY + IN_FLIGHT as usize;
+            let least = LEAST_STEADY_FRAMES + IN_FLIGHT as usize;
             let _ = writeln!(
                 text,
                 "\nframes/s: can't be told of {} frames; give --frames {least} or more",
                 self.frames
             );
         }
-        let told: String = self.predicted.iter().map(|p| losses(p.name(), &p.rows)).collect();
-        if !told.is_empty() {
-            text += &told;
+        let losses: String =
+            self.predicted.iter().map(|p| losses_table(p.name(), &p.rows)).collect();
+        if !losses.is_empty() {
+            text += &losses;
             text += "\nalone: eff. of frames/s. drawing: what tiles take beyond one core's share. tables: \
                      made by each worker for\na frame. messages: read and written. bricks: tiles lack \
                      some. on way: results and leases travel. dry: the\nmaster has nothing to lend. \
@@ -522,7 +538,7 @@ impl Said<'_> {
                         straggler_ms,link_ms,master_ms\n"
             .to_string();
         let rows = self.predicted.iter().flat_map(|p| p.rows.iter().map(move |r| (p.name(), r)));
-        let told = |n: Option<f64>| n.map_or_else(String::new, |n| n.to_string());
+        let number = |n: Option<f64>| n.map_or_else(String::new, |n| n.to_string());
         for (schedule, r) in rows {
             let _ = writeln!(
                 text,
@@ -531,8 +547,8 @@ impl Said<'_> {
                 r.first_ms,
                 r.frame_ms,
                 r.latency_efficiency,
-                told(r.throughput.map(|t| t.0)),
-                told(r.throughput.map(|t| t.1)),
+                number(r.throughput.map(|t| t.0)),
+                number(r.throughput.map(|t| t.1)),
                 r.bytes[0],
                 r.bytes[1],
                 r.bytes[2],

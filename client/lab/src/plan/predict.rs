@@ -1,4 +1,4 @@
-//! The predicted half: the scheduler against clusters that are not there.
+//! The predicted half: runs the scheduler against virtual clusters.
 
 use super::clock::cpu_ns;
 use super::costs;
@@ -18,16 +18,16 @@ use slabcast_sim::{
 };
 use slabcast_trace::Trace;
 
-/// What a frame's time goes into.
+/// The resource that bounds a frame's time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Bound {
-    /// Rendering, spread evenly.
+    /// Rendering, spread evenly over the threads.
     Cores,
-    /// Waiting for whoever has the last tile.
+    /// Waiting for the worker with the last tile.
     Straggler,
-    /// Bandwidth and latency.
+    /// Bandwidth and latency of the links.
     Link,
-    /// Decisions, and messages at the master.
+    /// Decisions and messages of the master.
     Master,
 }
 
@@ -42,48 +42,47 @@ impl Bound {
     }
 }
 
-/// What is said of a cluster.
+/// Prediction for one number of workers.
 #[derive(Clone, Debug)]
 pub(crate) struct Row {
     pub(crate) workers: u32,
-    /// The first frame, with all its bricks, in ms.
+    /// Time of the first frame, which includes sending all bricks, in ms.
     pub(crate) first_ms: f64,
-    /// A later frame, one in flight, in ms.
+    /// Mean time of a later frame with one in flight, in ms.
     pub(crate) frame_ms: f64,
-    /// Against one worker's best time over the number of render threads.
+    /// Best time of one core divided by the number of render threads and by `frame_ms`.
     pub(crate) latency_efficiency: f64,
-    /// Frames a second, as many in flight as a master has, and the same efficiency; nothing where fewer than
-    /// [`STEADILY`] come steadily.
+    /// Frames a second with [`IN_FLIGHT`] frames in flight, and their efficiency; `None` if fewer than
+    /// [`LEAST_STEADY_FRAMES`] frames are steady.
     pub(crate) throughput: Option<(f64, f64)>,
-    /// Bytes of a later frame: down, up, bricks.
+    /// Bytes of a later frame: to workers, to the master, bricks.
     pub(crate) bytes: [f64; 3],
-    /// Leases of a later frame.
+    /// Mean number of leases of a later frame.
     pub(crate) leases: f64,
-    /// The resource that a frame's time goes into before all, and which part.
+    /// The resource that takes most of a frame's time, and its share from 0 to 1.
     pub(crate) bound: (Bound, f64),
-    /// All parts: cores, straggler, link, master, in ms.
+    /// Time of a frame by resource, in ms: cores, straggler, link, master.
     pub(crate) parts: [f64; 4],
-    /// Work of the master a later frame, in ms: driver, streams, finisher.
+    /// Processor time of the master a later frame, in ms: driver, streams, finisher.
     pub(crate) master_ms: [f64; 3],
-    /// Messages of a later frame: from the master, how often some of those left together, to the master.
+    /// Messages of a later frame: from the master, its writes (several may share one), to the master.
     pub(crate) messages: [f64; 3],
-    /// What threads did while frames were delivered steadily; nothing where that can't be told, either.
+    /// Use of the threads while frames are steady; `None` where `throughput` is.
     pub(crate) steady: Option<Steady>,
 }
 
-/// Of the time with several frames in flight
+/// Use of the threads with several frames in flight, as shares of the time from 0 to 1.
 #[derive(Clone, Debug)]
 pub(crate) struct Steady {
-    /// what render threads lose, by the parts that [`LOSSES`] names,
+    /// Shares of the render threads' time that are lost, in the order of [`LOSSES`].
     pub(crate) lost: [f64; LOSSES.len()],
-    /// and how much the driver is busy, and each of the streams;
+    /// Utilisation of the driver, and of each stream thread.
     pub(crate) busy: [f64; 2],
-    /// and how long the scheduler decides for a frame, by the processor's clock.
+    /// Processor time of the scheduler's decisions for a frame, in ms.
     pub(crate) deciding_ms: f64,
 }
 
-/// What render threads' time goes into beside what drawing takes one core alone, by a word for tables and
-/// one for JSON.
+/// Losses of the render threads against one core alone: name in tables, name in JSON.
 pub(crate) const LOSSES: [(&str, &str); 7] = [
     ("drawing", "drawing"),
     ("tables", "tables"),
@@ -94,25 +93,30 @@ pub(crate) const LOSSES: [(&str, &str); 7] = [
     ("end", "end_of_path"),
 ];
 
-/// Frames that a master has in hand.
+/// Frames that a master has in flight.
 pub(crate) const IN_FLIGHT: u32 = FRAMES_IN_FLIGHT as u32;
 
-/// Frames that have to come steadily for throughput to be told by them, three times as many as are in flight. Of fewer chance
-/// says which came early: two of six came with 211 % of what all cores can do on a machine that something disturbed,
-/// five of nine with 154 % on seven workers and 83 on eight.
-pub(crate) const STEADILY: usize = 3 * IN_FLIGHT as usize;
+/// Least number of steady frames that throughput is measured over: three times those in flight. With
+/// fewer, chance decides: two of six frames came with an efficiency of 211 % on a disturbed machine,
+/// five of nine with 154 % on seven workers and 83 % on eight.
+pub(crate) const LEAST_STEADY_FRAMES: usize = 3 * IN_FLIGHT as usize;
 
-/// What is asked.
+/// The cluster to predict, apart from its number of workers.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Question {
+    /// Render threads of each worker.
     pub(crate) threads: u32,
     pub(crate) link: Link,
+    /// Cores that all processes share; `None` for one core a thread.
     pub(crate) cores: Option<u32>,
+    /// Factor on all tile times.
     pub(crate) stretch: f64,
+    /// Whether tiles after each worker's first are cut in quarters.
     pub(crate) mixed: bool,
 }
 
 impl Question {
+    /// Returns the virtual cluster of `workers` workers.
     pub(crate) fn cluster(&self, workers: u32, costs: Costs, in_flight: u32) -> Cluster {
         let &Question { threads, link, cores, stretch, mixed } = self;
         Cluster {
@@ -128,27 +132,28 @@ impl Question {
     }
 }
 
+/// Simulates the jobs on a virtual cluster.
 pub(crate) fn simulate(
     jobs: &[FrameJob],
     trace: &Trace,
     cluster: &Cluster,
 ) -> Result<Outcome, Fail> {
-    watched(jobs, trace, cluster, &mut NoObserver)
+    simulate_observed(jobs, trace, cluster, &mut NoObserver)
 }
 
-/// The same while somebody looks on.
-pub(crate) fn watched(
+/// Simulates the jobs on a virtual cluster and reports each frame to `observer`.
+pub(crate) fn simulate_observed(
     jobs: &[FrameJob],
     trace: &Trace,
     cluster: &Cluster,
-    watch: &mut dyn Observer,
+    observer: &mut dyn Observer,
 ) -> Result<Outcome, Fail> {
-    let ran = sim::run(jobs, trace, cluster, watch);
+    let ran = sim::run(jobs, trace, cluster, observer);
     ran.map(|r| r.0).map_err(|e| Fail::failed(e.to_string()))
 }
 
-/// Predicts every number of workers, on `threads` threads of this machine. `messages` are what messages
-/// cost; what deciding costs is measured for each number.
+/// Predicts each number of workers, on `threads` threads of this machine. `messages` holds the costs
+/// of messages; those of decisions are measured for each number.
 pub(crate) fn rows(
     jobs: &[FrameJob],
     trace: &Trace,
@@ -159,8 +164,8 @@ pub(crate) fn rows(
 ) -> Result<Vec<Row>, Fail> {
     let rows = map_parallel(workers.len(), threads, |i, _: &mut ()| {
         let cluster = (workers[i], question.threads);
-        let (one, _) = decided(jobs, trace, cluster, messages, 1)?;
-        let several = decided(jobs, trace, cluster, messages, IN_FLIGHT)?;
+        let (one, _) = measure_decisions(jobs, trace, cluster, messages, 1)?;
+        let several = measure_decisions(jobs, trace, cluster, messages, IN_FLIGHT)?;
         row(jobs, trace, workers[i], question, one, several)
     });
     rows.into_iter().collect()
@@ -179,21 +184,21 @@ fn row(
         simulate(jobs, trace, &question.cluster(workers, costs, in_flight))
     };
     let alone = sim::one_core_ms(trace) * question.stretch;
-    let steadily = sim::one_core_steady_ms(trace, IN_FLIGHT) * question.stretch;
+    let steady_alone_ms = sim::one_core_steady_ms(trace, IN_FLIGHT) * question.stretch;
     let threads = f64::from(workers * question.threads);
     let latency = run(question.link, costs, 1)?;
     let throughput = run(question.link, several, IN_FLIGHT)?;
-    // What a resource costs is what a frame is shorter by where there is plenty of it.
+    // The cost of a resource is the time that a frame saves when the resource is unlimited.
     let no_link = run(Link::UNLIMITED, costs, 1)?;
     let free = Costs { worker: costs.worker, ..Costs::default() };
-    let neither = run(Link::UNLIMITED, free, 1)?;
+    let no_link_or_master = run(Link::UNLIMITED, free, 1)?;
     let frame_ms = latency.frame_ms();
-    let cores = neither.mean(|f| f.render) / 1e6 / threads;
+    let cores = no_link_or_master.mean(|f| f.render) / 1e6 / threads;
     let parts = [
         cores,
-        (neither.frame_ms() - cores).max(0.0),
+        (no_link_or_master.frame_ms() - cores).max(0.0),
         (frame_ms - no_link.frame_ms()).max(0.0),
-        (no_link.frame_ms() - neither.frame_ms()).max(0.0),
+        (no_link.frame_ms() - no_link_or_master.frame_ms()).max(0.0),
     ];
     let all: f64 = parts.iter().sum();
     let kinds = [Bound::Cores, Bound::Straggler, Bound::Link, Bound::Master];
@@ -201,9 +206,9 @@ fn row(
     let frames = jobs.len() as f64;
     let each_ms = throughput.steady_interval_ms(IN_FLIGHT);
     let spent = throughput.thread_time;
-    let told = Outcome::steady_frames(jobs.len(), IN_FLIGHT) >= STEADILY;
-    let throughput_efficiency = steadily / threads / each_ms;
-    let steady = (told && spent.total() > 0).then(|| {
+    let enough_frames = Outcome::steady_frames(jobs.len(), IN_FLIGHT) >= LEAST_STEADY_FRAMES;
+    let throughput_efficiency = steady_alone_ms / threads / each_ms;
+    let steady = (enough_frames && spent.total() > 0).then(|| {
         let all_spent = spent.total() as f64;
         let part = |ns: u64| ns as f64 / all_spent;
         let drawing = part(spent.tiles + spent.tables + spent.blocks);
@@ -228,7 +233,7 @@ fn row(
         first_ms: latency.first_ms(),
         frame_ms,
         latency_efficiency: alone / threads / frame_ms,
-        throughput: told.then_some((1e3 / each_ms, throughput_efficiency)),
+        throughput: enough_frames.then_some((1e3 / each_ms, throughput_efficiency)),
         bytes: [latency.mean(|f| f.down), latency.mean(|f| f.up), latency.mean(|f| f.bricks)],
         leases: latency.mean(|f| f.leases),
         bound: (kinds[most], parts[most] / all),
@@ -249,10 +254,10 @@ fn row(
     })
 }
 
-/// How well tiles' estimates tell the order of their times under the `region` schedule, on so many workers:
-/// Spearman's rank correlation, mean of the views but the first. First of pixels under blocks of bricks,
-/// which is all that is known of a first view (the paper's Figure 1); then of what the views before
-/// taught. `None` where no view has three tiles.
+/// Returns Spearman's rank correlation of estimated and measured tile times under the `region`
+/// schedule on `workers` workers, as the mean over all views but the first. The first value is for
+/// estimates by pixels under blocks of bricks, all that is known of a first view (the paper's
+/// Figure 1); the second for estimates by earlier views. `None` if no view has three tiles.
 pub(crate) fn orders(
     jobs: &[FrameJob],
     trace: &Trace,
@@ -261,10 +266,10 @@ pub(crate) fn orders(
     let question =
         Question { threads: 1, link: Link::UNLIMITED, cores: None, stretch: 1.0, mixed: false };
     let cluster = question.cluster(workers, Costs::default(), 1);
-    let told = |jobs: &[FrameJob], trace: &Trace| -> Result<Vec<FrameStats>, Fail> {
-        let mut heard = Heard::default();
-        watched(jobs, trace, &cluster, &mut heard)?;
-        Ok(heard.0)
+    let stats_of = |jobs: &[FrameJob], trace: &Trace| -> Result<Vec<FrameStats>, Fail> {
+        let mut collected = StatsCollector::default();
+        simulate_observed(jobs, trace, &cluster, &mut collected)?;
+        Ok(collected.0)
     };
     let correlation = |stats: &FrameStats, i: usize| {
         let tiles = stats.slabs.first().map_or(&[][..], |slab| &slab.tiles[..]);
@@ -277,13 +282,13 @@ pub(crate) fn orders(
         });
         spearman(&pairs.collect::<Vec<_>>())
     };
-    let learned = told(jobs, trace)?;
+    let learned = stats_of(jobs, trace)?;
     let (mut sum, mut views) = ([0.0; 2], 0);
     for i in 1..jobs.len() {
-        // By itself it is a first view.
+        // Simulated alone, the view is a first one.
         let job = FrameJob { frame: FrameId(1), number: 0, ..jobs[i].clone() };
         let one = Trace { frames: vec![trace.frames[i].clone()], ..trace.clone() };
-        let plain = told(&[job], &one)?;
+        let plain = stats_of(&[job], &one)?;
         let of = |stats: Option<&FrameStats>| stats.and_then(|s| correlation(s, i));
         if let (Some(plain), Some(learned)) = (of(plain.first()), of(learned.get(i))) {
             sum = [sum[0] + plain, sum[1] + learned];
@@ -293,25 +298,27 @@ pub(crate) fn orders(
     Ok((views > 0).then(|| sum.map(|s| s / f64::from(views))))
 }
 
+/// Observer that collects the statistics of each frame.
 #[derive(Default)]
-struct Heard(Vec<FrameStats>);
+struct StatsCollector(Vec<FrameStats>);
 
-impl Observer for Heard {
+impl Observer for StatsCollector {
     fn frame_done(&mut self, _: FrameId, _: Box<FrameState>, stats: FrameStats, _: Spans) {
         self.0.push(stats);
     }
 }
 
-struct Cpu;
+/// Observer that lends the simulation the processor clock of this thread.
+struct CpuClock;
 
-impl Observer for Cpu {
+impl Observer for CpuClock {
     fn processor_ns(&mut self) -> Option<u64> {
         Some(cpu_ns())
     }
 }
 
-/// What it takes to read that clock, in nanoseconds: a call of the system, which no master makes.
-fn reading() -> f64 {
+/// Returns the ns that reading the processor clock takes: a system call, which no master makes.
+fn clock_read_ns() -> f64 {
     let once = || {
         let began = cpu_ns();
         cpu_ns() - began
@@ -319,20 +326,20 @@ fn reading() -> f64 {
     (0..99).map(|_| once()).min().unwrap_or(0) as f64
 }
 
-/// What messages and deciding cost on this machine.
+/// Measures the costs of messages and decisions on this machine.
 pub(crate) fn measured_costs(
     jobs: &[FrameJob],
     trace: &Trace,
     cluster: (u32, u32),
 ) -> Result<Costs, Fail> {
     let schedule = jobs.first().map_or(Schedule::Auto, |job| job.work.schedule);
-    Ok(decided(jobs, trace, cluster, costs::messages(trace, schedule), 1)?.0)
+    Ok(measure_decisions(jobs, trace, cluster, costs::messages(trace, schedule), 1)?.0)
 }
 
-/// What deciding costs on this machine: the scheduler runs the path once on so many workers of so many
-/// threads (whose tiles are in the trace), with so many frames in flight, and is timed. And how long it takes for a frame
-/// but the first, in ms.
-pub(crate) fn decided(
+/// Measures the costs of decisions on this machine: times the scheduler over the path on a virtual
+/// cluster of (workers, threads of each). Returns the costs with those of `messages`, and the ms of
+/// decisions for a frame but the first.
+pub(crate) fn measure_decisions(
     jobs: &[FrameJob],
     trace: &Trace,
     (workers, threads): (u32, u32),
@@ -341,16 +348,16 @@ pub(crate) fn decided(
 ) -> Result<(Costs, f64), Fail> {
     let question =
         Question { threads, link: Link::UNLIMITED, cores: None, stretch: 1.0, mixed: false };
-    let mut watch = Cpu;
+    let mut clock = CpuClock;
     let cluster = question.cluster(workers, messages, in_flight);
     let (_, took) =
-        sim::run(jobs, trace, &cluster, &mut watch).map_err(|e| Fail::failed(e.to_string()))?;
+        sim::run(jobs, trace, &cluster, &mut clock).map_err(|e| Fail::failed(e.to_string()))?;
     let DecisionTimes { first_frame, frames, slabs, results, prefetches, others, .. } = took;
     let result_count = took.result_count;
-    // Reading the clock takes part of what is of the order of a microsecond.
-    let reading = reading();
-    let each = |tally: Tally| (tally.each_ns() - reading).max(0.0);
-    // Sums go by their pixels, which the scheduler keeps; it keeps finished tiles as they come.
+    // Subtracted, since decisions take about a microsecond.
+    let read_ns = clock_read_ns();
+    let each = |tally: Tally| (tally.each_ns() - read_ns).max(0.0);
+    // The scheduler adds the pixels of sums but keeps finished tiles as they arrive.
     let finished =
         jobs.first().is_some_and(|j| j.work.schedule != Schedule::Slab && j.finish.is_some());
     let (fixed_ns, per_unit_ns) = match finished {
@@ -360,13 +367,13 @@ pub(crate) fn decided(
     // The first frame sorts the bricks into blocks.
     let begun = jobs.len().saturating_sub(1) as f64;
     let many = (result_count + prefetches.count + others.count) as f64 + jobs.len() as f64;
-    let beside = (slabs.ns + results.ns + prefetches.ns + others.ns) as f64 - reading * many;
+    let beside = (slabs.ns + results.ns + prefetches.ns + others.ns) as f64 - read_ns * many;
     let a_frame = frames.ns as f64 / begun.max(1.0) + beside.max(0.0) / jobs.len() as f64;
     let costs = Costs {
         first_brick_ns: first_frame.each_ns(),
         frame_brick_ns: frames.each_ns(),
         slab_brick_ns: slabs.each_ns(),
-        // A result and the lease that follows it are handled in one go.
+        // A result and the lease that follows it are one decision.
         result: LinearCost { fixed_ns, per_unit_ns },
         prefetch_ns: each(prefetches),
         event_ns: each(others),

@@ -1,9 +1,9 @@
-//! A prediction put to the test: a master and workers as processes of this machine, which speak as
-//! they would in a cluster and hold each tile for its time instead of drawing it.
+//! Tests a prediction with real processes: a master and workers on this machine, which exchange the
+//! messages of a cluster but hold each tile for its measured time instead of drawing it.
 //!
-//! What is compared is what the scheduler, gRPC and the system do with these tiles. All processes
-//! share this machine's cores, and the simulation is told so; where messages alone fill them, the
-//! rehearsal is no cluster any more, and the table says that too.
+//! This compares what the scheduler, gRPC and the system do with these tiles. All processes share
+//! the cores of this machine, and so they do in the simulation. Where messages alone fill the cores,
+//! the rehearsal no longer stands for a cluster; the table shows that as `busy`.
 
 use super::measure::FINISH;
 use super::predict::{self, Question};
@@ -28,52 +28,58 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// How long workers may take to come.
-const COME: Duration = Duration::from_secs(60);
-/// How long a path may take.
-const PLAY: Duration = Duration::from_secs(240);
-/// So many frames are played at least, one path after another: a frame of 10 ms measures nothing.
-const FRAMES: usize = 60;
+/// Longest time until all workers have joined.
+const JOIN_TIMEOUT: Duration = Duration::from_secs(60);
+/// Longest time of a rehearsal.
+const PLAY_TIMEOUT: Duration = Duration::from_secs(240);
+/// Least number of frames, by repeating the path: one frame of 10 ms measures nothing.
+const LEAST_FRAMES: usize = 60;
 
-/// What a rehearsal was.
+/// Result of one rehearsal, measured and predicted.
 #[derive(Clone, Debug)]
 pub(super) struct Rehearsed {
     pub(super) workers: u32,
-    /// Measured: mean of the frames but the first, in ms.
+    /// Measured mean time of the frames but the first, in ms.
     pub(super) frame_ms: f64,
-    /// Predicted for this machine.
+    /// Predicted mean time of the frames but the first, in ms.
     pub(super) predicted_ms: f64,
-    /// Measured: from one frame's coming to the next, in ms.
+    /// Measured interval between frames, in ms.
     pub(super) each_ms: f64,
+    /// Predicted interval between frames, in ms.
     pub(super) predicted_each_ms: f64,
-    /// Processor time of the master a frame, in ms; `None` where the system does not say.
+    /// Processor time of the master a frame, in ms; `None` if the system does not tell it.
     pub(super) master_ms: Option<f64>,
+    /// Predicted processor time of the master a frame, in ms.
     pub(super) predicted_master_ms: f64,
-    /// Of all workers.
+    /// Processor time of all workers a frame, in ms.
     pub(super) workers_ms: Option<f64>,
+    /// Predicted processor time of all workers a frame, in ms.
     pub(super) predicted_workers_ms: f64,
-    /// Which part of the machine's cores all of them had.
+    /// Utilisation of the machine's cores by master and workers, from 0 to 1.
     pub(super) busy: Option<f64>,
 }
 
-/// What a rehearsal's messages go over.
+/// The network between master and workers of a rehearsal.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Over<'a> {
-    /// Where its master listens.
-    pub(super) at: IpAddr,
-    /// What its workers are started by, in words.
-    pub(super) by: Option<&'a str>,
-    /// What lies between: what is predicted is of this.
+pub(super) struct Network<'a> {
+    /// Address at which the master listens.
+    pub(super) listen: IpAddr,
+    /// Command that starts the workers, separated by white space.
+    pub(super) worker_launcher: Option<&'a str>,
+    /// Link that the prediction assumes.
     pub(super) link: Link,
 }
 
-impl Over<'_> {
-    /// This machine's own, which has no limit.
-    pub(super) const LOOPBACK: Over<'static> =
-        Over { at: IpAddr::V4(Ipv4Addr::LOCALHOST), by: None, link: Link::UNLIMITED };
+impl Network<'_> {
+    /// The loopback interface of this machine, without a limit.
+    pub(super) const LOOPBACK: Network<'static> = Network {
+        listen: IpAddr::V4(Ipv4Addr::LOCALHOST),
+        worker_launcher: None,
+        link: Link::UNLIMITED,
+    };
 }
 
-/// A process that ends with this value.
+/// A child process, killed on drop.
 struct Process(Child);
 
 impl Drop for Process {
@@ -84,11 +90,11 @@ impl Drop for Process {
 }
 
 impl Process {
-    /// Starts this program, by way of other words if there are some.
-    fn start(by: Option<&str>, args: &[String]) -> Result<Process, Fail> {
+    /// Starts this program with `args`, by the command `launcher` if there is one.
+    fn start(launcher: Option<&str>, args: &[String]) -> Result<Process, Fail> {
         let program = std::env::current_exe()
             .map_err(|e| Fail::failed(format!("finding this program failed: {e}")))?;
-        let words = by.unwrap_or_default().split_whitespace().map(OsStr::new);
+        let words = launcher.unwrap_or_default().split_whitespace().map(OsStr::new);
         let mut words = words.chain([program.as_os_str()]);
         let mut command = Command::new(words.next().unwrap_or_default());
         command.args(words);
@@ -98,12 +104,12 @@ impl Process {
         }
         let child = command.spawn();
         child.map(Process).map_err(|e| {
-            let by = by.map(|by| format!("{by} ")).unwrap_or_default();
-            Fail::failed(format!("starting `{by}slabcast {}` failed: {e}", args.join(" ")))
+            let launcher = launcher.map(|words| format!("{words} ")).unwrap_or_default();
+            Fail::failed(format!("starting `{launcher}slabcast {}` failed: {e}", args.join(" ")))
         })
     }
 
-    /// Processor time of all its threads so far.
+    /// Returns the processor time of all its threads so far.
     fn cpu(&self) -> Option<Duration> {
         let tasks = std::fs::read_dir(format!("/proc/{}/task", self.0.id())).ok()?;
         let mut ns = 0u64;
@@ -115,10 +121,10 @@ impl Process {
     }
 }
 
-/// What all rehearsals of a command share.
-pub(super) struct PathScenes<'a> {
+/// Everything that the rehearsals of a command share.
+pub(super) struct Rehearsals<'a> {
     pub(super) volume: &'a Path,
-    /// The trace's file, and what is in it.
+    /// File of the trace, for the workers to read.
     pub(super) file: &'a Path,
     pub(super) trace: &'a Trace,
     pub(super) jobs: &'a [FrameJob],
@@ -126,11 +132,11 @@ pub(super) struct PathScenes<'a> {
     pub(super) axes: &'a AxisArgs,
     pub(super) threads: u32,
     pub(super) costs: Costs,
-    pub(super) over: Over<'a>,
+    pub(super) network: Network<'a>,
 }
 
-impl PathScenes<'_> {
-    /// Rehearses with each number of workers.
+impl Rehearsals<'_> {
+    /// Rehearses with each number of workers and predicts the same.
     pub(super) fn run(
         &self,
         workers: &[u32],
@@ -139,23 +145,30 @@ impl PathScenes<'_> {
         let runtime = runtime::start()?;
         let rehearsed = workers.iter().map(|&n| {
             progress.phase(&format!("rehearsing with {n} workers"));
-            self.beside(n, &runtime.block_on(self.one(n))?)
+            self.compare(n, &runtime.block_on(self.rehearse(n))?)
         });
         let result = rehearsed.collect::<Result<_, Fail>>();
         runtime::end(runtime);
         result
     }
 
-    async fn one(&self, n: u32) -> Result<Played, Fail> {
-        let Over { at, by, .. } = self.over;
-        let listen = SocketAddr::new(at, 0).to_string();
-        let mut args: Vec<String> =
-            ["master", "--listen", &listen, "--rehearse", "--log-level", "error", "--volume"]
-                .map(String::from)
-                .into();
+    async fn rehearse(&self, n: u32) -> Result<Played, Fail> {
+        let Network { listen, worker_launcher, .. } = self.network;
+        let listen_socket = SocketAddr::new(listen, 0).to_string();
+        let mut args: Vec<String> = [
+            "master",
+            "--listen",
+            &listen_socket,
+            "--rehearse",
+            "--log-level",
+            "error",
+            "--volume",
+        ]
+        .map(String::from)
+        .into();
         args.push(self.volume.display().to_string());
-        if !at.is_loopback() {
-            // Who names an address knows who reaches it.
+        if !listen.is_loopback() {
+            // The user named the address and knows who can reach it.
             args.push("--insecure".into());
         }
         for (flag, axis) in [("--up", self.axes.up), ("--front", self.axes.front)] {
@@ -168,7 +181,7 @@ impl PathScenes<'_> {
         let address = line.trim().strip_prefix("listening on ").map(String::from);
         let (Ok(_), Some(address)) = (read, address) else {
             return Err(Fail::failed(format!(
-                "the master of the rehearsal did not start at {at}; try `slabcast {}`",
+                "the master of the rehearsal did not start at {listen}; try `slabcast {}`",
                 args.join(" ")
             )));
         };
@@ -189,58 +202,71 @@ impl PathScenes<'_> {
                     "--log-level",
                     "error",
                 ];
-                Process::start(by, &args.map(String::from))
+                Process::start(worker_launcher, &args.map(String::from))
             })
             .collect::<Result<Vec<_>, _>>()?;
         let client = remote::connect(&address).await?;
-        let come = Instant::now();
+        let joining = Instant::now();
         while client.workers().await.map_err(|e| remote::client_failure(&e))?.len() < n as usize {
             for worker in &mut workers {
                 if let Ok(Some(status)) = worker.0.try_wait() {
-                    let by = by.map(|by| format!(" that `{by}` started")).unwrap_or_default();
+                    let started = worker_launcher
+                        .map(|words| format!(" that `{words}` started"))
+                        .unwrap_or_default();
                     return Err(Fail::failed(format!(
-                        "a worker of the rehearsal{by} has ended ({status}); try `slabcast worker \
+                        "a worker of the rehearsal{started} has ended ({status}); try `slabcast worker \
                          --master {address} --rehearse {file}` there"
                     )));
                 }
             }
-            if come.elapsed() > COME {
-                return Err(Fail::failed(format!("not all of {n} workers came within a minute")));
+            if joining.elapsed() > JOIN_TIMEOUT {
+                return Err(Fail::failed(format!(
+                    "not all of {n} workers joined within a minute; try fewer"
+                )));
             }
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
         let served = remote::describe(&client).await?;
-        let paths = FRAMES.div_ceil(self.jobs.len().max(1));
+        let paths = LEAST_FRAMES.div_ceil(self.jobs.len().max(1));
         let requests: Vec<PathRequest> = (0..paths)
             .map(|_| {
-                // As a plain `render` asks.
+                // The request of a plain `render`.
                 let PixelEncoding { format, background } = FINISH;
                 let mut request = self.request.clone();
                 (request.hashed, request.background) = (false, background);
                 request.to_message(&served.info, format, false)
             })
             .collect();
-        let played = tokio::time::timeout(PLAY, play(&client, &requests, &master, &workers)).await;
-        played.map_err(|_| Fail::failed("the rehearsal took more than 4 minutes"))?
+        let played =
+            tokio::time::timeout(PLAY_TIMEOUT, play(&client, &requests, &master, &workers)).await;
+        played.map_err(|_| {
+            Fail::failed("the rehearsal took more than 4 minutes; give fewer frames")
+        })?
     }
 
-    /// What is predicted for this machine, and what the scheduler says there that a later frame takes, in ms.
+    /// Simulates the rehearsal on this machine. Returns the outcome and the mean time of the frames
+    /// but the first by the scheduler's statistics, in ms.
     fn predict(&self, workers: u32) -> Result<(Outcome, f64), Fail> {
         let cores = Some(machine::cores());
-        let of = (workers, self.threads);
-        let (costs, _) =
-            predict::decided(self.jobs, self.trace, of, self.costs, predict::IN_FLIGHT)?;
+        let cluster_size = (workers, self.threads);
+        let (costs, _) = predict::measure_decisions(
+            self.jobs,
+            self.trace,
+            cluster_size,
+            self.costs,
+            predict::IN_FLIGHT,
+        )?;
         let question = Question {
             threads: self.threads,
-            link: self.over.link,
+            link: self.network.link,
             cores,
             stretch: 1.0,
             mixed: false,
         };
         let cluster = question.cluster(workers, costs, predict::IN_FLIGHT);
-        // The path again and again, as it is played.
+        // The path is repeated as in the rehearsal.
         let frames = self.jobs.len();
-        let all = frames * FRAMES.div_ceil(frames.max(1));
+        let all = frames * LEAST_FRAMES.div_ceil(frames.max(1));
         let again = |i: usize| FrameJob {
             frame: FrameId(i as u64 + 1),
             number: i as u64,
@@ -249,13 +275,13 @@ impl PathScenes<'_> {
         let jobs: Vec<FrameJob> = (0..all).map(again).collect();
         let traced = (0..all).map(|i| self.trace.frames[i % frames].clone()).collect();
         let trace = Trace { frames: traced, ..self.trace.clone() };
-        let mut heard = Totals::default();
-        let outcome = predict::watched(&jobs, &trace, &cluster, &mut heard)?;
-        Ok((outcome, mean(&heard.0)))
+        let mut totals = Totals::default();
+        let outcome = predict::simulate_observed(&jobs, &trace, &cluster, &mut totals)?;
+        Ok((outcome, mean(&totals.0)))
     }
 
-    /// What was measured, beside what is predicted.
-    fn beside(&self, workers: u32, played: &Played) -> Result<Rehearsed, Fail> {
+    /// Puts the measured figures of a rehearsal beside the predicted ones.
+    fn compare(&self, workers: u32, played: &Played) -> Result<Rehearsed, Fail> {
         let cores = machine::cores();
         let (predicted, predicted_ms) = self.predict(workers)?;
         // The first frame is left out on both sides.
@@ -281,13 +307,13 @@ impl PathScenes<'_> {
     }
 }
 
-/// Mean of all but the first.
+/// Returns the mean of all values but the first.
 fn mean(totals: &[f64]) -> f64 {
     let later = &totals[usize::from(totals.len() > 1)..];
     later.iter().sum::<f64>() / later.len().max(1) as f64
 }
 
-/// What frames take, as their statistics say, in ms.
+/// Observer that collects the total time of each frame, in ms.
 #[derive(Default)]
 struct Totals(Vec<f64>);
 
@@ -297,9 +323,9 @@ impl Observer for Totals {
     }
 }
 
-/// What was seen of a path.
+/// Measurements of one rehearsal.
 struct Played {
-    /// What frames took, as their statistics say, in ms.
+    /// Total time of each frame by its statistics, in ms.
     totals: Vec<f64>,
     each_ms: f64,
     took: Duration,
@@ -307,7 +333,7 @@ struct Played {
     workers: Option<Duration>,
 }
 
-/// Has paths played, and looks at frames and processes.
+/// Submits the paths and measures frames and processes.
 async fn play(
     client: &Client,
     requests: &[PathRequest],
@@ -316,7 +342,7 @@ async fn play(
 ) -> Result<Played, Fail> {
     let of_workers =
         || workers.iter().map(Process::cpu).try_fold(Duration::ZERO, |sum, d| Some(sum + d?));
-    // The others when the bricks are made: each job that finds none makes them.
+    // The other jobs follow once the bricks are made, since each job that finds none makes them.
     let mut jobs = VecDeque::new();
     let mut rest = requests.iter();
     if let Some(first) = rest.next() {
@@ -330,8 +356,8 @@ async fn play(
             let Update::Frame(frame) = update else { continue };
             came.push(Instant::now());
             if came.len() == 1 {
-                // Before the first frame the volume is cut into bricks and all of them are sent: from
-                // here on it counts.
+                // Measuring starts here: before the first frame the volume is cut into bricks, and all
+                // of them are sent.
                 for message in rest.by_ref() {
                     jobs.push_back(
                         client.submit(message).await.map_err(|e| remote::client_failure(&e))?,
@@ -362,9 +388,10 @@ async fn play(
     })
 }
 
-/// The comparison, for people.
-pub(super) fn table(schedule: &str, at: Option<IpAddr>, rows: &[Rehearsed]) -> String {
-    let over = at.map_or_else(|| "loopback".into(), |at| format!("over the link of {at}"));
+/// Returns the comparison as a table.
+pub(super) fn table(schedule: &str, listen: Option<IpAddr>, rows: &[Rehearsed]) -> String {
+    let over =
+        listen.map_or_else(|| "loopback".into(), |address| format!("over the link of {address}"));
     let mut text = format!(
         "\n{schedule} schedule, rehearsed on this machine ({over}, {} cores for all), measured \
          beside predicted:\n\n\
@@ -407,7 +434,7 @@ pub(super) fn table(schedule: &str, at: Option<IpAddr>, rows: &[Rehearsed]) -> S
     text
 }
 
-/// The same for programs.
+/// Returns the comparison as JSON objects.
 pub(super) fn json(schedule: &str, rows: &[Rehearsed]) -> Vec<serde_json::Value> {
     let row = |r: &Rehearsed| {
         serde_json::json!({

@@ -1,4 +1,4 @@
-//! The chart of a report: error down, time across, one mark a setting, the front drawn.
+//! The chart of a report: error against frame time, one mark a setting, the front as a line.
 
 use super::sweep::Group;
 use super::{Line, Report};
@@ -6,10 +6,10 @@ use crate::chart::{self, Anchor, Box2, Draw, LogAxis, Mark, Sheet, Theme, tick};
 use plotters::prelude::DrawingBackend;
 
 const SIZE: (u32, u32) = (1080, 700);
-/// What lies between the axes.
-const ROOM: Box2 = Box2 { x0: 78.0, y0: 76.0, x1: 876.0, y1: 634.0 };
+/// The plot area between the axes, in pixels.
+const PLOT_AREA: Box2 = Box2 { x0: 78.0, y0: 76.0, x1: 876.0, y1: 634.0 };
 
-/// What each kind of knob looks like, in the order of the legend.
+/// Label, mark and colour index of each knob, in the order of the legend.
 const KINDS: [(Group, &str, Mark, usize); 8] = [
     (Group::Thickness, "thickness", Mark::Dot, 0),
     (Group::Eps, "eps", Mark::Triangle, 1),
@@ -21,7 +21,7 @@ const KINDS: [(Group, &str, Mark, usize); 8] = [
     (Group::Combinations, "combinations", Mark::Dot, 7),
 ];
 
-/// The chart.
+/// Chart of error against time.
 pub(super) struct Chart<'a>(pub(super) &'a Report);
 
 impl Chart<'_> {
@@ -63,25 +63,36 @@ impl Draw for Chart<'_> {
 
         let x = LogAxis::over(self.lines().map(|l| l.ms.all.median));
         let y = LogAxis::over(self.lines().map(|l| l.error.rmse));
-        let at = |l: &Line| {
+        let position = |l: &Line| {
             let (tx, ty) = (x.at(l.ms.all.median), y.at(l.error.rmse));
-            (ROOM.x0 + tx * (ROOM.x1 - ROOM.x0), ROOM.y1 - ty * (ROOM.y1 - ROOM.y0))
+            (
+                PLOT_AREA.x0 + tx * (PLOT_AREA.x1 - PLOT_AREA.x0),
+                PLOT_AREA.y1 - ty * (PLOT_AREA.y1 - PLOT_AREA.y0),
+            )
         };
         for &t in &x.ticks {
-            let px = ROOM.x0 + x.at(t) * (ROOM.x1 - ROOM.x0);
-            on.line(&[(px, ROOM.y0), (px, ROOM.y1)], 1.0, theme.grid)?;
-            on.text(&tick(t), (px, ROOM.y1 + 18.0), 12.0, Anchor::Middle, theme.ink)?;
+            let px = PLOT_AREA.x0 + x.at(t) * (PLOT_AREA.x1 - PLOT_AREA.x0);
+            on.line(&[(px, PLOT_AREA.y0), (px, PLOT_AREA.y1)], 1.0, theme.grid)?;
+            on.text(&tick(t), (px, PLOT_AREA.y1 + 18.0), 12.0, Anchor::Middle, theme.ink)?;
         }
         for &t in &y.ticks {
-            let py = ROOM.y1 - y.at(t) * (ROOM.y1 - ROOM.y0);
-            on.line(&[(ROOM.x0, py), (ROOM.x1, py)], 1.0, theme.grid)?;
-            on.text(&tick(t), (ROOM.x0 - 8.0, py + 4.0), 12.0, Anchor::Right, theme.ink)?;
+            let py = PLOT_AREA.y1 - y.at(t) * (PLOT_AREA.y1 - PLOT_AREA.y0);
+            on.line(&[(PLOT_AREA.x0, py), (PLOT_AREA.x1, py)], 1.0, theme.grid)?;
+            on.text(&tick(t), (PLOT_AREA.x0 - 8.0, py + 4.0), 12.0, Anchor::Right, theme.ink)?;
         }
-        on.line(&[(ROOM.x0, ROOM.y0), (ROOM.x0, ROOM.y1), (ROOM.x1, ROOM.y1)], 1.2, theme.ink)?;
-        let middle = ((ROOM.x0 + ROOM.x1) / 2.0, (ROOM.y0 + ROOM.y1) / 2.0);
+        on.line(
+            &[
+                (PLOT_AREA.x0, PLOT_AREA.y0),
+                (PLOT_AREA.x0, PLOT_AREA.y1),
+                (PLOT_AREA.x1, PLOT_AREA.y1),
+            ],
+            1.2,
+            theme.ink,
+        )?;
+        let middle = ((PLOT_AREA.x0 + PLOT_AREA.x1) / 2.0, (PLOT_AREA.y0 + PLOT_AREA.y1) / 2.0);
         on.text(
             "ms a frame (median), less is better",
-            (middle.0, ROOM.y1 + 44.0),
+            (middle.0, PLOT_AREA.y1 + 44.0),
             13.0,
             Anchor::Middle,
             theme.ink,
@@ -91,18 +102,18 @@ impl Draw for Chart<'_> {
 
         let front = report.front();
         for pair in front.windows(2) {
-            on.line(&[at(pair[0]), at(pair[1])], 2.0, theme.ink)?;
+            on.line(&[position(pair[0]), position(pair[1])], 2.0, theme.ink)?;
         }
-        let mut taken: Vec<Box2> = self.lines().map(|l| Box2::about(at(l), 4.5)).collect();
+        let mut taken: Vec<Box2> = self.lines().map(|l| Box2::about(position(l), 4.5)).collect();
         for l in self.lines() {
             let Some((_, _, mark, colour)) = KINDS.iter().find(|k| k.0 == l.group) else {
                 continue;
             };
-            on.mark(*mark, at(l), if l.front { 5.0 } else { 3.6 }, theme.colours[*colour])?;
+            on.mark(*mark, position(l), if l.front { 5.0 } else { 3.6 }, theme.colours[*colour])?;
         }
-        // Labels keep off the front's line, too.
+        // Labels avoid the front's line, too.
         for pair in front.windows(2) {
-            let (a, b) = (at(pair[0]), at(pair[1]));
+            let (a, b) = (position(pair[0]), position(pair[1]));
             let n = (libm::hypot(b.0 - a.0, b.1 - a.1) / 6.0).ceil().max(1.0) as usize;
             for i in 0..=n {
                 let t = i as f64 / n as f64;
@@ -110,15 +121,15 @@ impl Draw for Chart<'_> {
             }
         }
         if let Some(knee) = front.iter().find(|l| l.knee) {
-            on.ring(at(knee), 10.0, theme.ink)?;
-            taken.push(Box2::about(at(knee), 11.0));
+            on.ring(position(knee), 10.0, theme.ink)?;
+            taken.push(Box2::about(position(knee), 11.0));
         }
         if let Some(l) = report.default() {
-            on.mark(Mark::Diamond, at(l), 7.5, theme.ground)?;
-            on.mark(Mark::Diamond, at(l), 6.0, theme.ink)?;
-            taken.push(Box2::about(at(l), 8.0));
+            on.mark(Mark::Diamond, position(l), 7.5, theme.ground)?;
+            on.mark(Mark::Diamond, position(l), 6.0, theme.ink)?;
+            taken.push(Box2::about(position(l), 8.0));
         }
-        // What matters most is named first; what finds no room stands in the table.
+        // The most important settings are labelled first; the table has those without room.
         let mut named: Vec<(&Line, String)> = Vec::new();
         if let Some(l) = report.default() {
             named.push((l, "as asked".into()));
@@ -130,7 +141,7 @@ impl Draw for Chart<'_> {
             named.push((l, l.name.clone()));
         }
         for l in self.lines().filter(|l| !l.front && !l.default) {
-            // One knob alone; combinations would crowd the rest out.
+            // Combinations would crowd out the labels of single knobs.
             if l.group != Group::Combinations {
                 named.push((l, l.name.clone()));
             }
@@ -138,13 +149,13 @@ impl Draw for Chart<'_> {
         for (l, name) in named {
             let size = if l.front || l.default { 11.5 } else { 10.0 };
             let colour = if l.front || l.default { theme.ink } else { theme.faint };
-            if let Some((place, own)) = chart::place(&name, size, at(l), &ROOM, &taken) {
-                // A label that had to go far is tied to its point.
+            if let Some((place, own)) = chart::place(&name, size, position(l), &PLOT_AREA, &taken) {
+                // A line ties a distant label to its point.
                 let end = (place.0.max(own.x0).min(own.x1), (own.y0 + own.y1) / 2.0);
-                let near = (end.0.max(at(l).0.min(own.x1)), end.1);
-                let far = libm::hypot(near.0 - at(l).0, near.1 - at(l).1);
+                let near = (end.0.max(position(l).0.min(own.x1)), end.1);
+                let far = libm::hypot(near.0 - position(l).0, near.1 - position(l).1);
                 if far > 22.0 {
-                    on.line(&[at(l), near], 0.8, theme.faint)?;
+                    on.line(&[position(l), near], 0.8, theme.faint)?;
                 }
                 on.text(&name, place, size, Anchor::Left, colour)?;
                 taken.push(own);
@@ -162,7 +173,7 @@ fn legend<DB: DrawingBackend>(
 where
     DB::ErrorType: 'static,
 {
-    let (x, mut y) = (ROOM.x1 + 26.0, ROOM.y0 + 12.0);
+    let (x, mut y) = (PLOT_AREA.x1 + 26.0, PLOT_AREA.y0 + 12.0);
     let word =
         |text: &str, y: f64| on.text(text, (x + 24.0, y + 4.0), 12.0, Anchor::Left, theme.ink);
     on.mark(Mark::Diamond, (x + 8.0, y), 6.0, theme.ink)?;

@@ -1,7 +1,7 @@
 //! `slabcast lab report`: error against run time, as a table, a chart and files for programs.
 //!
-//! [`sweep`] says which settings are drawn, [`chart`] draws what came out, [`write`](mod@write) puts
-//! it down. What measures is `front`.
+//! [`sweep`] lists the settings to draw, [`crate::autotune`] measures them, [`chart`] draws the
+//! results and [`write`](mod@write) writes the files.
 
 mod chart;
 mod sweep;
@@ -21,15 +21,14 @@ use std::path::PathBuf;
 use std::time::Instant;
 use sweep::{Group, Knob, SweepPoint};
 
-/// Sweeps the settings of quality for error against time.
+/// Sweeps the quality settings of one scene for error against time.
 ///
-/// Error against the limit and time a frame, for many settings of one scene; marks those that no
-/// other beats.
+/// Reports error and frame time of each setting, and marks the settings that no other beats.
 ///
-/// Errors are of the middle view of the path (of --views, spread over it), at a sample of its
-/// pixels, against the limit of what was asked for: its kernel, its light, its size. Times are from
-/// camera set to picture in memory, of several views, on one thread and on all; other work on the
-/// machine shows in them. Ctrl-C ends the sweep and keeps what is measured.
+/// Errors are measured at the middle view of the path (or --views of them), at a sample of pixels,
+/// against the limit of the requested kernel, light and size. Times are from camera set to picture
+/// in memory, over several views, on one thread and on all; other work on the machine lengthens
+/// them. Ctrl-C ends the sweep and keeps the settings measured so far.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -39,23 +38,22 @@ Examples:
 
 Files: report.json (all of it), report.csv (a line a setting), report.svg, report-dark.svg,
 report.png, report-dark.png (error down, time across).
-The front is what no other setting beats in both error and time; its knee is where more time stops
-to pay. `slabcast render --error` and `--budget` choose by the same measure.
+No setting on the front is beaten in both error and time; beyond its knee more time buys little. `slabcast render --error` and `--budget` choose by the same measure.
 JSON: {version, slabcast, pixels_version, volume, digest, tf, size, projection, views, judged_views,
 pixels, machine: {cpu, cores, simd, threads}, complete, skipped, settings: [{name, group, knob, flags,
 quality, shrink, shaded, sums, work: {tile, slabs, threads}, error: {rmse, max, most_999,
 share_above_1, rmse_srgb8, pixels}, own_error, ms: {one: {median, min, max, frames}, all}, voxels:
 {relevant, tossed, splatted, culled}, pixels, bytes, pixels_sha256, front, knee, default}]}. Errors in
-1/255; own_error is against the limit of the setting's own model, null where that is the same; bytes
-are those of its bricks as they are sent; front and knee are by the time on all threads; skipped
-settings have sheets so thin that thinner ones bought nothing any more.")]
+1/255; own_error is against the limit of the setting's own model, null where that is the same; bytes:
+of its bricks as sent; front and knee are by the time on all threads; skipped: settings with sheets
+thinner than those at which the error stopped falling.")]
 pub struct ReportArgs {
     #[command(flatten)]
     of: VolumeSceneArgs,
-    /// Folder for the files; it is made
+    /// Folder for the files; it is created
     #[arg(short, long, value_name = "DIR", default_value = "slabcast-report")]
     out: PathBuf,
-    /// Replaces a report that is there
+    /// Replace the files of an earlier report
     #[arg(long)]
     force: bool,
     /// Pixels of each judged view to compare with the reference
@@ -66,24 +64,24 @@ pub struct ReportArgs {
     #[arg(long, value_name = "N", default_value = "1",
           value_parser = clap::value_parser!(u32).range(1..=64))]
     views: u32,
-    /// Which sample of pixels
+    /// Seed of the sample of pixels
     #[arg(long, value_name = "N", default_value = "1")]
     seed: u64,
     /// Seconds of drawing for each time; three frames are timed at least
     #[arg(long, value_name = "S", default_value = "0.6", value_parser = slabcast_session::parse::positive)]
     seconds: f64,
-    /// Knobs to turn, of thickness, eps, kernel, sums, compositing, shading, size, combinations and
+    /// Settings to vary: thickness, eps, kernel, sums, compositing, shading, size, combinations and
     /// work [default: all]
     #[arg(long, value_name = "KNOB,...", value_delimiter = ',', value_enum)]
     only: Vec<Group>,
     #[command(flatten)]
     threads: ThreadArgs,
-    /// The table as JSON on stdout, beside the files
+    /// Print the report as JSON
     #[arg(long)]
     json: bool,
 }
 
-/// What a setting came to.
+/// Measured figures of one setting: a line of the report.
 #[derive(Clone, Debug, Serialize)]
 struct Line {
     name: String,
@@ -92,16 +90,16 @@ struct Line {
     flags: String,
     #[serde(flatten)]
     setting: Setting,
-    /// Decided.
+    /// Arithmetic of the sums, decided.
     sums: Sums,
     work: WorkUsed,
     error: Deviation,
     own_error: Option<Deviation>,
     ms: Times,
     voxels: Voxels,
-    /// Pixels that are drawn.
+    /// Number of pixels that are drawn.
     pixels: u64,
-    /// Of its bricks as they are sent.
+    /// Bytes of its bricks as sent.
     bytes: u64,
     pixels_sha256: String,
     front: bool,
@@ -118,8 +116,9 @@ struct WorkUsed {
 
 #[derive(Clone, Copy, Debug, Serialize)]
 struct Times {
-    /// On one thread; `null` for a trial of work on several.
+    /// Times on one thread; `None` for a work setting on several threads.
     one: Option<Timing>,
+    /// Times on all threads.
     all: Timing,
 }
 
@@ -139,7 +138,7 @@ struct Machine {
     threads: usize,
 }
 
-/// All that was found out.
+/// The report as it is written to report.json.
 #[derive(Clone, Debug, Serialize)]
 struct Report {
     version: u32,
@@ -151,24 +150,23 @@ struct Report {
     size: [u32; 2],
     views: usize,
     judged_views: Vec<usize>,
-    /// Compared of each judged view.
+    /// Pixels compared in each judged view.
     pixels: usize,
     machine: Machine,
-    /// Whether all that was to be drawn is in it.
+    /// False if the sweep was stopped early.
     complete: bool,
-    /// Settings that were not drawn: sheets twice as thick or more were as near to the limit as still
-    /// thicker ones.
+    /// Settings that were not drawn: the error had stopped falling at thicker sheets.
     skipped: Vec<String>,
     settings: Vec<Line>,
 }
 
 impl Report {
-    /// Marks the front of quality, and its knee.
+    /// Marks the settings on the Pareto front, and its knee.
     fn mark(&mut self) {
-        // Work changes no error: its trials are copies of the default's place.
-        let of: Vec<usize> =
+        // Work settings change no error: they would only repeat the default.
+        let candidates: Vec<usize> =
             (0..self.settings.len()).filter(|&i| self.settings[i].group != Group::Work).collect();
-        let points: Vec<Point> = of
+        let points: Vec<Point> = candidates
             .iter()
             .map(|&i| &self.settings[i])
             .map(|l| Point { ms: l.ms.all.median, error: l.error.rmse })
@@ -179,14 +177,14 @@ impl Report {
             (line.front, line.knee) = (false, false);
         }
         for &i in &front {
-            self.settings[of[i]].front = true;
+            self.settings[candidates[i]].front = true;
         }
         if let Some(i) = knee {
-            self.settings[of[i]].knee = true;
+            self.settings[candidates[i]].knee = true;
         }
     }
 
-    /// The front, from fast to slow.
+    /// Returns the settings on the front, from fast to slow.
     fn front(&self) -> Vec<&Line> {
         let mut front: Vec<&Line> = self.settings.iter().filter(|l| l.front).collect();
         front.sort_by(|a, b| a.ms.all.median.total_cmp(&b.ms.all.median));
@@ -198,12 +196,16 @@ impl Report {
     }
 }
 
-/// Runs the command.
+/// Runs `slabcast lab report`: writes its files and prints the table, or JSON with `--json`.
+///
+/// # Errors
+/// The arguments or the volume are refused, the folder has a report already, or a file can't be
+/// written.
 pub fn run(args: &ReportArgs) -> Result<(), Fail> {
     let made = write::check(args)?;
     let args = args.clone();
     signals::run_to_end(move || {
-        // Held until the files are there.
+        // Removes the folder on drop, if it is still empty.
         let _made = made;
         let report = measure(&args)?;
         write::files(&args.out, &report)?;
@@ -229,10 +231,10 @@ fn measure(args: &ReportArgs) -> Result<Report, Fail> {
     let mut truths = Vec::new();
     let mut judging = Progress::new(false).counting("pixel");
     let all = args.pixels as usize * judged.len();
-    judging.frames(all as u64, "what the picture should be, by the reference");
+    judging.frames(all as u64, "the exact picture, by the reference");
     for (n, &view) in judged.iter().enumerate() {
-        let told = (&mut judging, n * args.pixels as usize);
-        truths.push(trial.truth(view, args.pixels as usize, args.seed, told)?);
+        let counter = (&mut judging, n * args.pixels as usize);
+        truths.push(trial.truth(view, args.pixels as usize, args.seed, counter)?);
         if signals::stop_requested() {
             break;
         }
@@ -269,7 +271,7 @@ fn measure(args: &ReportArgs) -> Result<Report, Fail> {
             report.mark();
             return Ok(report);
         }
-        if pointless(&report.settings, point) {
+        if no_longer_pays(&report.settings, point) {
             report.skipped.push(point.setting.name(&trial.base));
         } else {
             report.settings.push(line(&mut trial, point, &truths, args)?);
@@ -287,7 +289,7 @@ fn measure(args: &ReportArgs) -> Result<Report, Fail> {
     Ok(report)
 }
 
-/// `n` numbers below `views`, spread evenly and off the ends.
+/// Returns up to `n` indices of `views` views, spread evenly and away from the ends.
 fn spread(views: usize, n: usize) -> Vec<usize> {
     let n = n.min(views);
     let mut all: Vec<usize> = (0..n).map(|i| (2 * i + 1) * views / (2 * n)).collect();
@@ -295,9 +297,9 @@ fn spread(views: usize, n: usize) -> Vec<usize> {
     all
 }
 
-/// Whether thinner sheets buy nothing any more: of the same setting in thicker sheets, two are known
-/// and the thinner of them is no nearer to the limit.
-fn pointless(known: &[Line], point: &SweepPoint) -> bool {
+/// Returns whether thinner sheets no longer pay: two thicker variants of the setting are known, and
+/// the error of the thinner one is no lower.
+fn no_longer_pays(known: &[Line], point: &SweepPoint) -> bool {
     let thickness = point.setting.quality.thickness;
     let mut alike: Vec<(f64, f64)> = known
         .iter()
@@ -323,10 +325,10 @@ fn line(
     let own = if setting.same_model(&base) {
         None
     } else {
-        let of = truths.iter().map(|t| trial.own_truth(setting, t));
-        Some(of.collect::<Result<Vec<_>, _>>()?)
+        let limits = truths.iter().map(|t| trial.own_truth(setting, t));
+        Some(limits.collect::<Result<Vec<_>, _>>()?)
     };
-    let Judged { sums, off, own, counters, sha256 } =
+    let Judged { sums, deviation, own, counters, sha256 } =
         trial.judge(setting, truths, own.as_deref())?;
     let effort = |cut| Effort { cut, seconds: args.seconds };
     let all = trial.time(setting, effort(point.cut))?;
@@ -341,7 +343,7 @@ fn line(
     Ok(Line {
         name: match point.knob {
             Knob::Quality => setting.name(&base),
-            Knob::Work(what) => what.to_string(),
+            Knob::Work(knob) => knob.to_string(),
         },
         group: point.group,
         knob: lower(&point.group),
@@ -349,7 +351,7 @@ fn line(
         setting: *setting,
         sums,
         work: WorkUsed { tile: point.cut.tile, slabs: point.cut.slabs, threads: point.cut.threads },
-        error: off,
+        error: deviation,
         own_error: own,
         ms: Times { one, all },
         voxels: Voxels {

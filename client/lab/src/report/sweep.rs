@@ -1,5 +1,5 @@
-//! Which settings are tried: each knob alone, the combinations that may be worth it, and the work
-//! knobs, which change time alone.
+//! The settings of the sweep: each quality knob alone, promising combinations, and the work knobs,
+//! which change the time only.
 
 use crate::autotune::setting::Setting;
 use crate::autotune::trial::Trial;
@@ -8,11 +8,11 @@ use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
 use slabcast_session::direct::Cut;
 use std::fmt;
 
-/// What a trial turns.
+/// The knob that a setting varies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Group {
-    /// What was asked for.
+    /// None: the requested setting.
     #[value(skip)]
     Default,
     Thickness,
@@ -26,7 +26,7 @@ pub(crate) enum Group {
     Work,
 }
 
-/// A change of how the work is cut, in words.
+/// A change of how the work is divided; displayed as `tile 64`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum WorkKnob {
     Tile(u32),
@@ -44,14 +44,14 @@ impl fmt::Display for WorkKnob {
     }
 }
 
-/// What kind of a knob.
+/// Whether a setting changes the picture or only the division of work.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Knob {
     Quality,
     Work(WorkKnob),
 }
 
-/// One row of the report.
+/// One setting of the sweep.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct SweepPoint {
     pub(super) group: Group,
@@ -60,15 +60,15 @@ pub(super) struct SweepPoint {
     pub(super) cut: Cut,
 }
 
-/// Edge of tiles where it is not what is tried: what `bench` takes.
-const TILE: u32 = 64;
+/// Edge of tiles in pixels where it is not varied: the default of `bench`.
+const TILE_EDGE: u32 = 64;
 
 const THICKNESSES: [f64; 8] = [4.0, 2.0, 1.5, 1.0, 0.75, 0.5, 0.25, 0.125];
 const EPSES: [f64; 7] =
     [1.0 / 16.0, 1.0 / 64.0, 1.0 / 128.0, 1.0 / 256.0, 1.0 / 1024.0, 1.0 / 4096.0, 0.0];
-/// A picture drawn at a quarter has one pixel of sixteen.
+/// Factors by which the picture is drawn smaller; 4 leaves one pixel in sixteen.
 const SHRINKS: [u32; 2] = [2, 4];
-/// Of combinations. One more of each doubles the sweep.
+/// Values that are combined: thickness, eps, sums, shrink. One more of each doubles the sweep.
 const COMBINED: ([f64; 4], [f64; 3], [Sums; 2], [u32; 2]) = (
     [2.0, 1.0, 0.5, 0.25],
     [1.0 / 64.0, 1.0 / 512.0, 1.0 / 4096.0],
@@ -76,8 +76,8 @@ const COMBINED: ([f64; 4], [f64; 3], [Sums; 2], [u32; 2]) = (
     [1, 2],
 );
 
-/// All trials that `only` names (or all), the default first; what is refused (16 bits under a
-/// tent) or no change is left out.
+/// Returns the settings that vary the knobs in `only` (all, if empty), the default first. Leaves out
+/// invalid settings (16 bits with a tent) and repeats.
 pub(super) fn points(trial: &Trial, only: &[Group]) -> Vec<SweepPoint> {
     list(trial.base, trial.size(), trial.threads, trial.is_shaded(), only)
 }
@@ -89,7 +89,7 @@ fn list(
     shaded: bool,
     only: &[Group],
 ) -> Vec<SweepPoint> {
-    let cut = Cut { threads, tile: TILE, slabs: 1 };
+    let cut = Cut { threads, tile: TILE_EDGE, slabs: 1 };
     let mut all: Vec<SweepPoint> = Vec::new();
     let mut put = |group: Group, setting: Setting| {
         let wanted = group == Group::Default || only.is_empty() || only.contains(&group);

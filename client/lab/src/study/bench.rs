@@ -6,7 +6,7 @@ use super::simulate::{Bed, Pace};
 use super::{
     Effects, Machine, Study, StudyArgs, effects, live, nodes, order, runs, verdict, write,
 };
-use crate::plan::measure::{self, Path as Measured};
+use crate::plan::measure::{self, MeasureArgs};
 use crate::plan::{GOODPUT, pinged};
 use slabcast_common::quality::{Borders, Kernel, Quality, Schedule, Work};
 use slabcast_common::view::MAX_EDGE;
@@ -102,8 +102,8 @@ impl Bench<'_> {
     ) -> Result<Bed, Fail> {
         let most = NODES.iter().map(|n| n - 1).chain(self.live.iter().copied());
         let wanted = most.chain([paper::FIGURE_1_WORKERS]);
-        let path = Measured {
-            stage,
+        let path = MeasureArgs {
+            scenes: stage,
             frames: views,
             work: request.work,
             wanted: wanted.map(|n| (TILES_A_NODE * f64::from(n)).ceil() as u64).collect(),

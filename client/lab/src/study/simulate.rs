@@ -120,7 +120,7 @@ impl Bed {
             Question { threads: 1, link: self.link, cores: None, stretch, mixed: ask.mixed };
         let mut heard = Listener::default();
         let cluster = question.cluster(ask.workers, costs, 1);
-        predict::watched(&self.under(ask), &self.trace, &cluster, &mut heard)?;
+        predict::simulate_observed(&self.under(ask), &self.trace, &cluster, &mut heard)?;
         heard.0.sort_by_key(|t| t.0.frame);
         Ok(heard.0)
     }

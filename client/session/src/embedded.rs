@@ -1,7 +1,7 @@
 //! A master and its workers inside this process.
 //!
 //! They speak the same messages as over a network, through channels; the scheduler can't tell
-//! (DESIGN.md section 2). Bricks are shared, not copied.
+//! (docs/design/cluster.md section 2). Bricks are shared, not copied.
 
 use crate::fail::Fail;
 use crate::machine::cores;

@@ -7,6 +7,9 @@ use slabcast_common::view::MAX_EDGE;
 use slabcast_scene::path::MAX_FRAMES;
 
 /// Parses a finite number.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn number(text: &str) -> Result<f64, String> {
     match text.trim().parse::<f64>() {
         Ok(x) if x.is_finite() => Ok(x),
@@ -16,6 +19,9 @@ pub fn number(text: &str) -> Result<f64, String> {
 }
 
 /// Parses a finite number above 0.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn positive(text: &str) -> Result<f64, String> {
     match number(text)? {
         x if x > 0.0 => Ok(x),
@@ -24,6 +30,9 @@ pub fn positive(text: &str) -> Result<f64, String> {
 }
 
 /// Parses a number or a fraction (`1/512`).
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn fraction(text: &str) -> Result<f64, String> {
     let bad = || "give a number or a fraction, like 0.002 or 1/512".to_string();
     let x = match text.split_once('/') {
@@ -40,6 +49,9 @@ pub fn fraction(text: &str) -> Result<f64, String> {
 }
 
 /// Parses a time with its unit (`100ms`, `0.5s`) into ms.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn time(text: &str) -> Result<f64, String> {
     let bad = || "give a time above 0 with its unit, like 100ms or 0.5s".to_string();
     let digits = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
@@ -54,6 +66,9 @@ pub fn time(text: &str) -> Result<f64, String> {
 }
 
 /// Parses `WxH` into pixels.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn size(text: &str) -> Result<[u32; 2], String> {
     let bad = || format!("give WIDTHxHEIGHT in pixels, 1 to {MAX_EDGE} each, like 512x512");
     let (w, h) = text.split_once(['x', 'X']).ok_or_else(bad)?;
@@ -65,6 +80,9 @@ pub fn size(text: &str) -> Result<[u32; 2], String> {
 }
 
 /// Parses `transparent`, `black`, `white`, `R,G,B` (0 to 1) or `#rrggbb`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn background(text: &str) -> Result<Background, String> {
     let bad = "give transparent, R,G,B with numbers from 0 to 1 (like 0.1,0.1,0.2), or #rrggbb";
     match text {
@@ -94,6 +112,9 @@ pub fn background(text: &str) -> Result<Background, String> {
 }
 
 /// Parses a number of bytes: `512MiB`, `2GB`, `1073741824`; 16 MiB to 1 PiB.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn memory(text: &str) -> Result<u64, String> {
     let bad = || "give bytes with a unit, from 16MiB to 1024TiB, like 512MiB or 2GiB".to_string();
     let digits = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
@@ -136,16 +157,25 @@ fn host_port(text: &str, any_port: bool) -> Result<String, String> {
 }
 
 /// Parses the address of a master, `HOST:PORT`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn master(text: &str) -> Result<String, String> {
     host_port(text, false)
 }
 
 /// Parses the address that a master listens on, `HOST:PORT`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn listen(text: &str) -> Result<String, String> {
     host_port(text, true)
 }
 
 /// Parses the edge of a macrotile, or `auto`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn tile(text: &str) -> Result<Tile, String> {
     match text {
         "auto" => Ok(Tile(None)),
@@ -160,6 +190,9 @@ pub fn tile(text: &str) -> Result<Tile, String> {
 pub struct Tile(pub Option<u32>);
 
 /// Parses a worker's name: one line of a table.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn worker_name(text: &str) -> Result<String, String> {
     if (1..=100).contains(&text.len()) && !text.chars().any(char::is_control) {
         Ok(text.into())
@@ -169,12 +202,18 @@ pub fn worker_name(text: &str) -> Result<String, String> {
 }
 
 /// Parses three numbers of samples, `AxBxC`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn dims(text: &str) -> Result<[u64; 3], String> {
     three(text, |n: &u64| (1..=16384).contains(n))
         .ok_or_else(|| "give AxBxC, like 256x256x128, each from 1 to 16384".into())
 }
 
 /// Parses three lengths, `AxBxC`, in mm.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn spacing(text: &str) -> Result<[f64; 3], String> {
     three(text, |x: &f64| x.is_normal() && *x > 0.0)
         .ok_or_else(|| "give three lengths above 0 as AxBxC, like 0.5x0.5x1.25".into())
@@ -186,6 +225,9 @@ fn three<T: std::str::FromStr>(text: &str, good: impl Fn(&T) -> bool) -> Option<
 }
 
 /// Parses the type of raw numbers, such as `uint8`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn number_type(text: &str) -> Result<String, String> {
     let types = slabcast_volumes::RawHints::TYPES;
     match slabcast_volumes::RawHints::default().with_type(text) {
@@ -195,6 +237,9 @@ pub fn number_type(text: &str) -> Result<String, String> {
 }
 
 /// Parses `little` or `big`; true is big.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn byte_order(text: &str) -> Result<bool, String> {
     match text {
         "little" => Ok(false),
@@ -204,6 +249,9 @@ pub fn byte_order(text: &str) -> Result<bool, String> {
 }
 
 /// Parses `on` or `off`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn on_off(text: &str) -> Result<bool, String> {
     match text {
         "on" => Ok(true),
@@ -217,6 +265,9 @@ pub fn on_off(text: &str) -> Result<bool, String> {
 pub struct Workers(pub Vec<u32>);
 
 /// Parses numbers of workers: `16`, `1..64`, `1,2,4,8` or a mixture.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn workers(text: &str) -> Result<Workers, String> {
     let bad = || "give numbers from 1 to 1024, as 1..64 or 1,2,4,8".to_string();
     let number = |t: &str| {
@@ -256,6 +307,9 @@ impl std::fmt::Display for Rate {
 }
 
 /// Parses the rate of a link: `1gbit`, `2.5gbit`, `100mbit` or `unlimited`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn link(text: &str) -> Result<Rate, String> {
     let bad = || "give a rate, as 1gbit, 10gbit or 100mbit, or unlimited".to_string();
     if text == "unlimited" {
@@ -273,6 +327,9 @@ pub fn link(text: &str) -> Result<Rate, String> {
 }
 
 /// Parses a latency (`100us`, `1.5ms`, `0`) into ns.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn latency(text: &str) -> Result<u64, String> {
     let bad = || "give a time, as 50us or 1ms, at most 10s".to_string();
     let (digits, unit) = match text {
@@ -307,6 +364,9 @@ impl Pixels {
 }
 
 /// Parses a number of pixels, or `all`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn pixels(text: &str) -> Result<Pixels, String> {
     match text.parse::<u32>() {
         _ if text == "all" => Ok(Pixels::All),
@@ -316,6 +376,9 @@ pub fn pixels(text: &str) -> Result<Pixels, String> {
 }
 
 /// Parses a pixel, `X,Y` from the top left.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn pixel(text: &str) -> Result<[u32; 2], String> {
     let bad = || "give a pixel as X,Y, from 0,0 at the top left".to_string();
     let (x, y) = text.split_once(',').ok_or_else(bad)?;
@@ -324,6 +387,9 @@ pub fn pixel(text: &str) -> Result<[u32; 2], String> {
 }
 
 /// Parses the name of a PNG file.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn png(text: &str) -> Result<std::path::PathBuf, String> {
     let path = std::path::PathBuf::from(text);
     match path.extension() {
@@ -342,6 +408,9 @@ pub enum Frames {
 }
 
 /// Parses `18` or `30..60`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn frames(text: &str) -> Result<Frames, String> {
     let bad =
         || format!("give 1..={MAX_FRAMES} frames, or the first and last wanted, as in 30..60");
@@ -361,6 +430,9 @@ pub fn frames(text: &str) -> Result<Frames, String> {
 }
 
 /// Parses `head` or a direction `X,Y,Z`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn light(text: &str) -> Result<Light, String> {
     if text == "head" {
         return Ok(Light::Head(HeadWord::Head));
@@ -375,6 +447,9 @@ pub fn light(text: &str) -> Result<Light, String> {
 }
 
 /// Parses the look of NaN: `COLOUR` or `COLOUR:OPACITY`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn nan(text: &str) -> Result<NanColour, String> {
     let bad = || {
         "give a colour, R,G,B (0 to 1) or #rrggbb, and after a colon its opacity (0 to 1)"

@@ -105,7 +105,7 @@ def main():
             value = sig if kind == "field" else returns[1] if returns else ""
             if kind == "const" and (m := re.search(r": ([^=]+)=", sig)):
                 value = m[1]
-            if NUMERIC.match(value.strip()):
+            if NUMERIC.match(value.strip()) and not re.search(r"\b(Micros|Nanos)\b", value):
                 numbers += 1
                 if not UNIT_IN_NAME.search(name.lower()) and not UNIT_IN_DOC.search(text):
                     no_unit += 1

@@ -1,4 +1,5 @@
-//! Leases: which task of a frame goes to which worker, and when (section 4.4; DESIGN.md section 3).
+//! Leases: which task of a frame goes to which worker, and when (section 4.4;
+//! docs/design/cluster.md section 3).
 //!
 //! ```text
 //! slab     every thread gets a task, round robin; then tasks are lent ahead
@@ -140,10 +141,10 @@ impl SlabFrame {
     /// Lends tasks to free threads, and sends bricks.
     ///
     /// First every thread gets a task, round robin. Then tasks are lent ahead, so that a thread
-    /// need not wait for a round trip between two (TRANSPORT.md: two in flight a thread hide the
-    /// latency of 64x64 tiles), but not the last ones, as many as there are threads: those go one
-    /// by one to whichever worker runs idle, since an idle worker can't take a task that waits
-    /// behind another on one worker. Where another frame comes after, nothing is held back.
+    /// need not wait for a round trip between two (docs/design/transport.md: two in flight a thread
+    /// hide the latency of 64x64 tiles), but not the last ones, as many as there are threads: those
+    /// go one by one to whichever worker runs idle, since an idle worker can't take a task that
+    /// waits behind another on one worker. Where another frame comes after, nothing is held back.
     pub(crate) fn dispatch(&mut self, cluster: &mut Cluster, context: StepContext, now: Micros) {
         let mut leases = self.choose(cluster, context, now);
         self.core.speculate_at = None;

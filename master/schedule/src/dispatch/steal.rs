@@ -1,6 +1,6 @@
 //! Work stealing (`region` schedule): an idle worker takes a waiting tile of the worker that would
-//! end later, or, at the end of a sole frame, a piece of a tile that is being rendered (DESIGN.md
-//! section 3: take-over with its state).
+//! end later, or, at the end of a sole frame, a piece of a tile that is being rendered
+//! (docs/design/cluster.md section 3: take-over with its state).
 //!
 //! ```text
 //! a thread is idle                    takes a waiting tile of another worker      (steal_waiting)
@@ -29,8 +29,9 @@ use crate::dispatch::speculate::patience_us;
 use crate::policy::cost_history::WHOLE_PX;
 use crate::policy::macrotile::Macrotile;
 use crate::state::cluster::Cluster;
-use crate::state::frame::{StepContext, check_sums};
+use crate::state::frame::StepContext;
 use crate::state::region_frame::RegionFrame;
+use crate::state::result_checks::check_sums;
 use crate::state::task_queue::{End, Lease, TaskQueue};
 use crate::state::worker_map::WorkerMap;
 use slabcast_common::ids::{Epoch, WorkerId};

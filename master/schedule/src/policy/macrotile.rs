@@ -171,9 +171,9 @@ pub fn cut_mixed(
 /// those of blocks of bricks.
 ///
 /// A tile's size does not change what drawing it takes until it is smaller than a part of 64 pixels
-/// (docs/scaling.md), while each task costs its messages. So the coarsest level is chosen that
-/// still gives `many` tiles; one finer than that of 64 pixels only where there would be no more
-/// than `wanted`.
+/// (docs/measurements/scaling.md), while each task costs its messages. So the coarsest level is
+/// chosen that still gives `many` tiles; one finer than that of 64 pixels only where there would be
+/// no more than `wanted`.
 pub fn cut_through(
     size: [u32; 2],
     rects: &[Rect],

@@ -7,6 +7,7 @@ pub(crate) mod leases;
 pub(crate) mod region_frame;
 pub(crate) mod region_tiles;
 pub(crate) mod residency;
+pub(crate) mod result_checks;
 pub(crate) mod slab_frame;
 pub(crate) mod task_queue;
 pub(crate) mod worker_map;

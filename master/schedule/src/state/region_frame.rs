@@ -1,5 +1,5 @@
-//! A frame under the `region` schedule: one phase through all depths, without a barrier (DESIGN.md
-//! section 3).
+//! A frame under the `region` schedule: one phase through all depths, without a barrier
+//! (docs/design/cluster.md section 3).
 //!
 //! A task is one tile through all sheets. The master culls nothing: workers do, and ask for the
 //! bricks that they lack. What is left to decide is how large a tile is and which worker owns it:

@@ -3,7 +3,7 @@
 //!
 //! A task may be out on several leases: its worker was lost, is late, or leaves. Each lease has its
 //! own epoch. The first result with a live epoch counts and ends all others; later ones are counted
-//! and dropped (DESIGN.md section 3, Leases).
+//! and dropped (docs/design/cluster.md section 3, Leases).
 //!
 //! **Which task kills workers?** A lost worker tells nothing. Its first leases, as many as it has
 //! threads, were probably running, and each of them is a suspect. With several threads an innocent
@@ -11,10 +11,10 @@
 //! together. So a suspect is never lent to a worker that has another, and when a worker is lost
 //! with a suspect on it, only those blamed most before are blamed again.
 //!
-//! A cluster may also lose workers for reasons of its own (PROMISES.md R1 kills 7 of 8 in one
-//! frame): a tile that three of them happened to hold is innocent. A deadly tile is held by every
-//! worker that is lost. So each loss that a tile has an alibi for asks for one more witness against
-//! it, up to twice as many.
+//! A cluster may also lose workers for reasons of its own (docs/design/promises.md R1 kills 7 of 8
+//! in one frame): a tile that three of them happened to hold is innocent. A deadly tile is held by
+//! every worker that is lost. So each loss that a tile has an alibi for asks for one more witness
+//! against it, up to twice as many.
 
 use crate::policy::macrotile::Macrotile;
 use crate::{Config, Micros};

@@ -28,6 +28,7 @@ mod pixel_records;
 mod pixel_sample;
 mod quadrature;
 mod reference;
+mod reference_convergence;
 mod reference_profile;
 mod rooms;
 mod row_records;

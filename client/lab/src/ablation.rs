@@ -1,7 +1,8 @@
-//! What a scene does not need, and what leaving it out saves: `slabcast lab explain` without a pixel.
+//! Ablation of a scene, for `slabcast lab explain` without a pixel: what the renderer leaves out, and
+//! what that saves.
 //!
-//! Each row is measured: the scene is drawn as it is and with the thing kept (or the test switched
-//! off), in turn, and the two pictures are compared, to the bit.
+//! Each row is measured. The scene is drawn as it is and with the thing kept (or the test switched
+//! off), in turn, and the two pictures are compared to the bit.
 
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{Background, Picture};
@@ -20,91 +21,93 @@ use std::fmt::Write;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Frames of each way, in turn.
+/// Timed frames of each of the two variants.
 const TURNS: usize = 5;
 
-/// Voxels of a volume that is cut a second time with everything in it: some 5 bytes each.
+/// Largest number of voxels of a volume that is cut again with its empty voxels, some 5 bytes each.
 const MOST_VOXELS: u64 = 1 << 26;
 
-/// One thing that a scene may need or not.
+/// One thing that a scene may leave out: a row of the table.
 struct Row {
     name: &'static str,
     left_out: bool,
     why: String,
-    /// In one copy of the bricks, or in a picture.
+    /// Bytes saved in one copy of the bricks, or in a picture.
     bytes: Option<u64>,
-    /// Of a frame: drawn with it, less drawn without.
+    /// Time saved of a frame, in ms.
     ms: Option<f64>,
-    /// Of cutting the bricks, once a volume.
+    /// Time saved when the bricks are cut, in ms, once a volume.
     cut_ms: Option<f64>,
-    /// Whether the picture with it has the same bytes.
+    /// Whether the picture stays the same, to the bit.
     same: Option<bool>,
+    /// Flag that keeps the thing, or empty.
     force: &'static str,
 }
 
-/// All of it.
-pub(crate) struct Needs {
+/// Savings of a scene.
+pub(crate) struct Savings {
     scene: String,
     size: [u32; 2],
     threads: usize,
-    /// A frame as it is drawn.
+    /// Median time of a frame as it is drawn.
     ms: f64,
     relevant: u64,
     bytes: u64,
     rows: Vec<Row>,
 }
 
-/// A scene that is ready, and what it took to cut it.
-struct Way {
-    stage: PathScenes,
-    frame_of: Quality,
+/// One variant of the scene, ready to draw, and the time of cutting its bricks.
+struct Variant {
+    scenes: PathScenes,
+    quality: Quality,
     cut_ms: f64,
 }
 
-impl Way {
+impl Variant {
     fn new(
         volume: &Volume,
         info: &VolumeInfo,
         request: &RenderRequest,
         o: Orientation,
         keep: Keep,
-    ) -> Result<Way, Fail> {
+    ) -> Result<Variant, Fail> {
         let mut request = request.clone();
         request.work.keep = keep;
         let request = request;
         let began = Instant::now();
-        let stage = PathScenes::new(volume, info, &request, o)?;
+        let scenes = PathScenes::new(volume, info, &request, o)?;
         let cut_ms = began.elapsed().as_secs_f64() * 1e3;
-        let frame_of = stage.spec(0).quality;
-        Ok(Way { stage, frame_of, cut_ms })
+        let quality = scenes.spec(0).quality;
+        Ok(Variant { scenes, quality, cut_ms })
     }
 
     fn bytes(&self) -> u64 {
-        self.stage.bricks.iter().map(|b| b.encoded_len() as u64).sum()
+        self.scenes.bricks.iter().map(|b| b.encoded_len() as u64).sum()
     }
 
     fn voxels(&self) -> u64 {
-        self.stage.bricks.iter().map(|b: &Arc<Brick>| b.len() as u64).sum()
+        self.scenes.bricks.iter().map(|b: &Arc<Brick>| b.len() as u64).sum()
     }
 }
 
-/// Draws two ways in turn; their medians in milliseconds, and whether the pictures are the same.
-fn in_turn(ways: [(&Way, Quality); 2], threads: usize) -> Result<([f64; 2], bool), Fail> {
+/// Draws two variants in turn. Returns their median times in ms, and whether the pictures are the
+/// same.
+fn in_turn(variants: [(&Variant, Quality); 2], threads: usize) -> Result<([f64; 2], bool), Fail> {
     let cut = Cut { tile: 64, ..Cut::on(threads) };
-    let ways = ways.map(|(way, quality)| {
-        let spec = SceneSpec { quality, ..way.stage.spec(0) };
-        (way, Arc::new(Scene::new(&spec)))
+    let variants = variants.map(|(variant, quality)| {
+        let spec = SceneSpec { quality, ..variant.scenes.spec(0) };
+        (variant, Arc::new(Scene::new(&spec)))
     });
     let mut ms = [Vec::new(), Vec::new()];
     let mut pictures: [Option<Picture>; 2] = [None, None];
     for turn in 0..=TURNS {
         for i in 0..2 {
-            let (way, scene) = &ways[i];
-            let view = way.stage.view(0, &scene.quality)?;
+            let (variant, scene) = &variants[i];
+            let view = variant.scenes.view(0, &scene.quality)?;
             let began = Instant::now();
             let frame = Frame::new(scene.clone(), view);
-            let picture = direct::draw(&frame, &way.stage.bricks, cut);
-            // The first fills tables and caches.
+            let picture = direct::draw(&frame, &variant.scenes.bricks, cut);
+            // The first frame fills tables and caches.
             if turn > 0 {
                 ms[i].push(began.elapsed().as_secs_f64() * 1e3);
             }
@@ -119,23 +122,23 @@ fn in_turn(ways: [(&Way, Quality); 2], threads: usize) -> Result<([f64; 2], bool
     Ok((ms.map(median), a == b))
 }
 
-/// Finds it out.
-pub(crate) fn find(of: &VolumeSceneArgs, threads: usize) -> Result<Needs, Fail> {
+/// Measures what the scene leaves out and what that saves.
+pub(crate) fn measure(of: &VolumeSceneArgs, threads: usize) -> Result<Savings, Fail> {
     let request = of.scene.request(Work::default())?;
     let OpenedVolume { volume, info, orientation } = of.open(&request)?;
     let mut progress = Progress::new(false);
     progress.phase("drawing with and without");
-    let way = |keep| Way::new(&volume, &info, &request, orientation, keep);
-    let base = way(Keep::default())?;
-    let spec = base.stage.spec(0);
-    let quality = base.frame_of;
+    let variant = |keep| Variant::new(&volume, &info, &request, orientation, keep);
+    let base = variant(Keep::default())?;
+    let spec = base.scenes.spec(0);
+    let quality = base.quality;
     let (voxels, bytes) = (base.voxels(), base.bytes());
     let all: u64 = info.lattice.dims.iter().map(|&n| u64::from(n)).product();
     let mut rows = Vec::new();
 
-    // Keeping something in the bricks.
+    // Things left out of the bricks.
     let mut kept = |name, why: String, keep: Keep, force| -> Result<(), Fail> {
-        let with = way(keep)?;
+        let with = variant(keep)?;
         let ([less, more], same) = in_turn([(&base, quality), (&with, quality)], threads)?;
         rows.push(Row {
             name,
@@ -186,11 +189,11 @@ pub(crate) fn find(of: &VolumeSceneArgs, threads: usize) -> Result<Needs, Fail> 
     }
     rows.append(&mut later);
 
-    // Looking at what is hidden.
+    // Hidden bricks.
     let look = Quality { cull: false, ..quality };
     let ([ms, blind], same) = in_turn([(&base, quality), (&base, look)], threads)?;
-    let frame = base.stage.frame(0)?;
-    let picture = direct::draw(&frame, &base.stage.bricks, Cut::on(threads));
+    let frame = base.scenes.frame(0)?;
+    let picture = direct::draw(&frame, &base.scenes.bricks, Cut::on(threads));
     let shut = picture.pixels.iter().filter(|p| 1.0 - p[3] < quality.eps as f32).count();
     let covered = picture.pixels.iter().filter(|p| p[3] > 0.0).count();
     if shut > 0 {
@@ -216,7 +219,7 @@ pub(crate) fn find(of: &VolumeSceneArgs, threads: usize) -> Result<Needs, Fail> 
         );
         rows.push(Row { same: Some(same), force: "--cull off", ..needed("hidden", &why) });
     }
-    let view = base.stage.view(0, &quality)?;
+    let view = base.scenes.view(0, &quality)?;
     let flat = matches!(view.projection, Projection::Ortho { .. });
     rows.push(Row {
         left_out: flat,
@@ -266,7 +269,7 @@ pub(crate) fn find(of: &VolumeSceneArgs, threads: usize) -> Result<Needs, Fail> 
         ));
     }
     progress.end();
-    Ok(Needs {
+    Ok(Savings {
         scene: format!("{}, {}", volume.name, request.transfer.name()),
         size: view.size,
         threads,
@@ -277,20 +280,20 @@ pub(crate) fn find(of: &VolumeSceneArgs, threads: usize) -> Result<Needs, Fail> 
     })
 }
 
-/// For people.
-pub(crate) fn text(needs: &Needs) -> String {
-    let [w, h] = needs.size;
+/// Returns the savings as a table.
+pub(crate) fn text(savings: &Savings) -> String {
+    let [w, h] = savings.size;
     let mut out = format!(
         "{}, {w}x{h}: {:.1} ms a frame on {} thread{}; {} visible voxels in {} of bricks\n\n",
-        needs.scene,
-        needs.ms,
-        needs.threads,
-        if needs.threads == 1 { "" } else { "s" },
-        needs.relevant,
-        progress::bytes(needs.bytes)
+        savings.scene,
+        savings.ms,
+        savings.threads,
+        if savings.threads == 1 { "" } else { "s" },
+        savings.relevant,
+        progress::bytes(savings.bytes)
     );
     out.push_str("left out      saves, ms a frame      bytes   ms of cutting  same picture\n");
-    for r in needs.rows.iter().filter(|r| r.left_out) {
+    for r in savings.rows.iter().filter(|r| r.left_out) {
         let number = |x: Option<f64>| x.map_or_else(|| "-".into(), |x| format!("{x:.1}"));
         let _ = writeln!(
             out,
@@ -309,7 +312,7 @@ pub(crate) fn text(needs: &Needs) -> String {
         );
     }
     out.push_str("\nneeded, or not left out\n");
-    for r in needs.rows.iter().filter(|r| !r.left_out) {
+    for r in savings.rows.iter().filter(|r| !r.left_out) {
         let _ = writeln!(out, "{:<13} {}", r.name, r.why);
     }
     out.push_str(
@@ -319,9 +322,9 @@ pub(crate) fn text(needs: &Needs) -> String {
     out
 }
 
-/// For programs.
-pub(crate) fn json(needs: &Needs) -> String {
-    let rows: Vec<_> = needs
+/// Returns the savings as JSON.
+pub(crate) fn json(savings: &Savings) -> String {
+    let rows: Vec<_> = savings
         .rows
         .iter()
         .map(|r| {
@@ -333,8 +336,8 @@ pub(crate) fn json(needs: &Needs) -> String {
         })
         .collect();
     serde_json::json!({
-        "scene": needs.scene, "size": needs.size, "threads": needs.threads, "ms": needs.ms,
-        "voxels": needs.relevant, "bytes": needs.bytes, "rows": rows,
+        "scene": savings.scene, "size": savings.size, "threads": savings.threads, "ms": savings.ms,
+        "voxels": savings.relevant, "bytes": savings.bytes, "rows": rows,
     })
     .to_string()
         + "\n"

@@ -1,9 +1,9 @@
-//! `slabcast lab bench`: how long a frame takes in this process, without a cluster.
+//! `slabcast lab bench`: times frames in this process, without a cluster.
 //!
-//! A frame's time runs from camera set to picture in memory: tables, projection of bricks,
-//! rendering, compositing. Reading, bricking and writing pictures are not in it. The first view
-//! warms up and is left out; every view is another one, so nothing can be kept from one to the
-//! next but what a worker keeps, too.
+//! The time of a frame runs from camera set to picture in memory: tables, projection of bricks,
+//! rendering, compositing. It excludes reading and bricking the volume and writing pictures. The
+//! first view warms up and is left out. All views differ, so that only what a worker keeps, too, is
+//! kept from one to the next.
 
 use crate::autotune::choose::settle;
 use slabcast_common::message::Counters;
@@ -23,10 +23,10 @@ use std::time::Instant;
 
 /// Times the frames of a view path in this process.
 ///
-/// Milliseconds, counts and error of one run.
+/// Prints time, voxel counts and error of one run.
 ///
-/// A frame's time runs from camera set to picture in memory. The first view warms up and is left
-/// out. The error is that of the middle view, as `slabcast lab error` has it.
+/// The time of a frame runs from camera set to picture in memory. The first view warms up and is
+/// left out. The error is that of the middle view, measured as by `slabcast lab error`.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -47,7 +47,7 @@ pub struct BenchArgs {
     #[arg(long, value_name = "N", default_value = "1024",
           value_parser = clap::value_parser!(u32).range(0..=1 << 26))]
     pixels: u32,
-    /// Which sample of pixels
+    /// Seed of the sample of pixels
     #[arg(long, value_name = "N", default_value = "1")]
     seed: u64,
     /// As JSON
@@ -55,7 +55,10 @@ pub struct BenchArgs {
     json: bool,
 }
 
-/// Runs the command.
+/// Runs `slabcast lab bench`: prints times, counts and error, or JSON with `--json`.
+///
+/// # Errors
+/// The arguments or the volume are refused, or no setting meets `--error` or `--budget`.
 pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     let work = Work { keep: args.keep.keep(), ..Work::default() };
     let mut request = args.of.scene.request_with_target(work)?;
@@ -63,8 +66,8 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
     let volume = Arc::new(volume);
     settle(&volume, &info, &mut request, orientation, threads)?;
-    let stage = PathScenes::new(&volume, &info, &request, orientation)?;
-    let bricks = &stage.bricks;
+    let scenes = PathScenes::new(&volume, &info, &request, orientation)?;
+    let bricks = &scenes.bricks;
     drop(volume);
     let cut = Cut { threads, tile: args.tile, slabs: 1 };
     let views = request.path.frames();
@@ -73,7 +76,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     let (mut each, mut counters, mut middle) = (Vec::new(), Counters::default(), None);
     let (mut sha256, mut adds) = (String::new(), None);
     for i in 0..views {
-        let (view, scene) = (stage.view(i, &request.quality)?, stage.scene(i));
+        let (view, scene) = (scenes.view(i, &request.quality)?, scenes.scene(i));
         let began = Instant::now();
         let frame = Frame::new(scene, view);
         let (picture, counted) = direct::draw_counted(&frame, bricks, cut);
@@ -86,12 +89,12 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
         if i == views / 2 {
             sha256 = picture.sha256().to_string();
             adds = frame.footprint_cost();
-            middle = Some((stage.view_at_size(i, &request.quality, request.size())?, picture));
+            middle = Some((scenes.view_at_size(i, &request.quality, request.size())?, picture));
         }
         progress.step(progress::Step { frames: i as u64 + 1, ..Default::default() });
     }
     progress.end();
-    let quality = stage.spec(views / 2).quality;
+    let quality = scenes.spec(views / 2).quality;
     let mut ms = each[usize::from(views > 1)..].to_vec();
     ms.sort_by(f64::total_cmp);
     let n = ms.len() as u64;
@@ -99,7 +102,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     let relevant: u64 = bricks.iter().map(|b| b.len() as u64).sum();
     let errors = middle.filter(|_| args.pixels > 0).map(|(view, picture)| {
         let sample = stratified(request.size(), args.pixels as usize, args.seed);
-        let reference = Reference::new(&stage.spec(views / 2), view, bricks);
+        let reference = Reference::new(&scenes.spec(views / 2), view, bricks);
         let mut progress = Progress::new(false).counting("pixel");
         progress.frames(sample.len() as u64, "the reference");
         let truth = direct::map_pixels(&sample, threads, (&mut progress, 0), |[x, y]| {
@@ -107,8 +110,8 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
         });
         progress.end();
         let (limit, same): (Vec<_>, Vec<_>) = truth.into_iter().unzip();
-        let at = |p: &[u32; 2]| picture.pixels[(p[1] * request.size()[0] + p[0]) as usize];
-        let got: Vec<_> = sample.iter().map(at).collect();
+        let pixel = |p: &[u32; 2]| picture.pixels[(p[1] * request.size()[0] + p[0]) as usize];
+        let got: Vec<_> = sample.iter().map(pixel).collect();
         [limit, same].map(|want| ErrorFigures::compare(&got, &want, request.background))
     });
     let simd = Simd::detect().name();
@@ -118,15 +121,15 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
             "version": env!("CARGO_PKG_VERSION"),
             "pixels_version": slabcast_common::PIXELS_VERSION,
             "median_ms": median, "min_ms": least, "max_ms": most, "views": n,
-            // In the order of the path, the warming-up first: whoever runs this several times can
-            // tell a slow view from a machine that was disturbed.
+            // In the order of the path, warm-up first: over several runs this tells a slow view
+            // from a disturbed machine.
             "each_ms": each,
             "threads": threads, "tile": args.tile, "simd": simd, "size": request.size(),
             "magnify": request.magnify,
             "quality": quality, "relevant": relevant, "pixels_sha256": sha256,
             "tossed": counters.tossed / n, "splatted": counters.splatted / n,
             "culled": counters.culled / n,
-            // What a voxel adds to, where that is the same for all: sums of so many pixels, so many bytes each.
+            // Sums that each voxel adds to: pixels, and bytes of each. Null if voxels differ.
             "adds": adds.map(|adds| serde_json::json!({ "pixels": adds.pixels, "bytes": adds.bytes })),
             "limit": errors.as_ref().map(|e| figures(&e[0])),
             "same_thickness": errors.as_ref().map(|e| figures(&e[1])),

@@ -1,8 +1,9 @@
-//! `slabcast lab explain`: why a pixel is as it is, and what a scene does not need ([`crate::ablation`]).
+//! `slabcast lab explain`: explains the colour of a pixel sheet by sheet, or the savings of a scene
+//! ([`crate::ablation`]).
 //!
-//! The numbers are the renderer's own ([`slabcast_render::oracle::explain`]): the pixel that they lead to
-//! is the pixel of the picture, to the bit. Beside each sheet stands what the same sheets are in
-//! f64, and below all of them the limit.
+//! The numbers are the renderer's own ([`slabcast_render::oracle::explain`]): they lead to the pixel
+//! of the picture, to the bit. Each line has the transmittance of f64 sheets for comparison, and
+//! below all lines stands the limit.
 
 use crate::ablation;
 use crate::single_frame::SingleFrame;
@@ -18,16 +19,16 @@ use std::fmt::Write;
 
 /// Explains a pixel, or what a scene does not need.
 ///
-/// What leaving it out saves; with --pixel, a pixel sheet by sheet: what is in it, which voxels made
-/// it, where it was shut.
+/// With --pixel: each sheet at the pixel, the voxels behind it, and where the pixel was shut.
+/// Without: what the scene leaves out, and what that saves.
 ///
 /// The first view of the path is taken. Without --pixel the scene is drawn as it is and with each
-/// thing kept that it leaves out, in turn, and the pictures are compared. With it, for each sheet that holds something at the pixel, front to
-/// back: transmittance T behind it, its optical depth tau, its colour, the same T from f64 sheets
-/// that round nothing and shut nothing, and how many voxels of how many bricks made it, the
-/// strongest first. All numbers but those are the renderer's own, in its arithmetic: they lead to
-/// the pixel of the picture to the bit. Below stand the pixel, the same sheets in f64, and the
-/// limit of infinitely thin sheets.
+/// thing kept that it leaves out, in turn, and the pictures are compared. With --pixel, each line is
+/// a sheet that holds something there, front to back: its optical depth tau, its colour, the
+/// transmittance T behind it, T by f64 sheets that round and shut nothing, and how many voxels of
+/// how many bricks it is made of, the strongest first. All other numbers are the renderer's own, in
+/// its arithmetic: they lead to the pixel of the picture to the bit. Below stand the pixel, the
+/// pixel of f64 sheets, and the limit of infinitely thin sheets.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -53,7 +54,7 @@ null where the pixel stays open; reference is null where f64 sheets have nothing
 pub struct ExplainArgs {
     #[command(flatten)]
     of: VolumeSceneArgs,
-    /// The pixel, from 0,0 at the top left
+    /// Pixel to explain; 0,0 is at the top left
     #[arg(long, value_name = "X,Y", value_parser = parse::pixel)]
     pixel: Option<[u32; 2]>,
     /// Voxels to list for each sheet, strongest first
@@ -66,78 +67,81 @@ pub struct ExplainArgs {
     json: bool,
 }
 
-/// A pixel, and what it should be.
-struct Found {
-    at: [u32; 2],
+/// The explanation of a pixel, and its exact colours.
+struct ExplainedPixel {
+    pixel: [u32; 2],
     size: [u32; 2],
     thickness: f64,
     eps: f64,
     explained: PixelExplanation,
-    /// The same sheets in f64.
+    /// Sheets of the same thickness in f64, by their index.
     sheets: BTreeMap<i64, ReferenceSheet>,
     same_thickness: [f64; 4],
     limit: [f64; 4],
     values: ValueMap,
 }
 
-/// Runs the command.
+/// Runs `slabcast lab explain`: prints a table, or JSON with `--json`.
+///
+/// # Errors
+/// The arguments or the volume are refused, or the user stopped it.
 pub fn run(args: &ExplainArgs) -> Result<(), Fail> {
     let Some(pixel) = args.pixel else {
-        let needs = {
+        let savings = {
             let args = args.clone();
-            signals::run_unless_stopped(move || ablation::find(&args.of, args.threads.count()))?
+            signals::run_unless_stopped(move || ablation::measure(&args.of, args.threads.count()))?
         };
-        return say(&if args.json { ablation::json(&needs) } else { ablation::text(&needs) });
+        return say(&if args.json { ablation::json(&savings) } else { ablation::text(&savings) });
     };
     let found = {
         let args = args.clone();
-        signals::run_unless_stopped(move || find(&args, pixel))?
+        signals::run_unless_stopped(move || explain_pixel(&args, pixel))?
     };
     say(&if args.json { json(&found) } else { text(&found) })
 }
 
-fn find(args: &ExplainArgs, at: [u32; 2]) -> Result<Found, Fail> {
-    // A pixel that was magnified comes from no sheets of its own.
+fn explain_pixel(args: &ExplainArgs, pixel: [u32; 2]) -> Result<ExplainedPixel, Fail> {
+    // `request` refuses targets, since a magnified pixel has no sheets of its own.
     args.of.scene.request(Default::default())?;
-    let still = SingleFrame::read(&args.of, 1, |[w, h]| {
-        if at[0] < w && at[1] < h {
+    let scene = SingleFrame::read(&args.of, 1, |[w, h]| {
+        if pixel[0] < w && pixel[1] < h {
             return Ok(());
         }
         Err(Fail::usage(format!(
             "--pixel: {},{} is not in the picture, which has {w}x{h} pixels; give 0,0 to \
                  {},{}, or another --size",
-            at[0],
-            at[1],
+            pixel[0],
+            pixel[1],
             w - 1,
             h - 1
         )))
     })?;
-    let [x, y] = at;
-    let quality = still.spec.quality;
-    let explained = explain(&still.frame(quality), &still.bricks, at, args.voxels);
-    let reference = still.reference();
+    let [x, y] = pixel;
+    let quality = scene.spec.quality;
+    let explained = explain(&scene.frame(quality), &scene.bricks, pixel, args.voxels);
+    let reference = scene.reference();
     let sheets = reference.sheet_by_sheet(x, y, SheetOptions::default());
-    Ok(Found {
-        at,
-        size: still.view.size,
+    Ok(ExplainedPixel {
+        pixel,
+        size: scene.view.size,
         thickness: quality.thickness,
         eps: quality.eps,
         same_thickness: sheets.last().map_or([0.0; 4], |s| s.so_far),
         limit: reference.pixel(x, y),
         sheets: sheets.into_iter().map(|s| (s.k, s)).collect(),
-        values: still.spec.volume.summary.map,
+        values: scene.spec.volume.summary.map,
         explained,
     })
 }
 
-/// Largest difference of four channels, in 1/255.
-fn off(got: [f32; 4], want: [f64; 4]) -> f64 {
+/// Returns the largest difference of four channels, in 1/255.
+fn largest_error(got: [f32; 4], want: [f64; 4]) -> f64 {
     (0..4).map(|c| (f64::from(got[c]) - want[c]).abs() * 255.0).fold(0.0, f64::max)
 }
 
-fn text(found: &Found) -> String {
+fn text(found: &ExplainedPixel) -> String {
     let e = &found.explained;
-    let [x, y] = found.at;
+    let [x, y] = found.pixel;
     let [w, h] = found.size;
     let mut out = format!("pixel {x},{y} of {w}x{h}\n\n");
     out.push_str(
@@ -177,12 +181,12 @@ fn text(found: &Found) -> String {
     out.push_str("linear, premultiplied   R         G         B         A   off by, 1/255\n");
     out += &row("pixel", e.pixel.map(f64::from), String::new());
     let same = found.same_thickness;
-    out += &row("sheets in f64", same, number(off(e.pixel, same)));
-    out += &row("limit", found.limit, number(off(e.pixel, found.limit)));
+    out += &row("sheets in f64", same, number(largest_error(e.pixel, same)));
+    out += &row("limit", found.limit, number(largest_error(e.pixel, found.limit)));
     out
 }
 
-fn put_sheet(out: &mut String, found: &Found, s: &SheetAtPixel) {
+fn put_sheet(out: &mut String, found: &ExplainedPixel, s: &SheetAtPixel) {
     let d = found.thickness;
     let [r, g, b] = s.colour.map(|c| format!("{c:.3}"));
     let t64 = found.sheets.get(&i64::from(s.k)).map(|r| number(1.0 - r.so_far[3]));
@@ -215,13 +219,13 @@ fn put_sheet(out: &mut String, found: &Found, s: &SheetAtPixel) {
     }
 }
 
-/// A value of the volume: whole numbers as such.
+/// Formats a value of the volume; whole numbers without decimals.
 fn plain(x: f64) -> String {
     let text = format!("{x:.4}");
     if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').into() } else { text }
 }
 
-/// Four digits or so.
+/// Formats a number with about four digits.
 fn number(x: f64) -> String {
     if x == 0.0 {
         "0".into()
@@ -232,7 +236,7 @@ fn number(x: f64) -> String {
     }
 }
 
-fn json(found: &Found) -> String {
+fn json(found: &ExplainedPixel) -> String {
     let e = &found.explained;
     let section = |v: &SectionAtPixel| {
         serde_json::json!({
@@ -254,11 +258,11 @@ fn json(found: &Found) -> String {
         })
     };
     let value = serde_json::json!({
-        "pixel": found.at, "size": found.size, "rgba": e.pixel,
+        "pixel": found.pixel, "size": found.size, "rgba": e.pixel,
         "same_thickness": found.same_thickness, "limit": found.limit,
         "error": {
-            "limit": off(e.pixel, found.limit),
-            "same_thickness": off(e.pixel, found.same_thickness)
+            "limit": largest_error(e.pixel, found.limit),
+            "same_thickness": largest_error(e.pixel, found.same_thickness)
         },
         "shut_in": e.shut_in, "voxels": e.voxels, "bricks": e.bricks,
         "hidden": {"voxels": e.hidden_voxels, "bricks": e.hidden_bricks},

@@ -9,7 +9,8 @@ use std::path::PathBuf;
 
 /// Makes a recorded run's decisions again and compares.
 ///
-/// Exit code 0 where they are, 1 where one differs or the file is broken; the line is named.
+/// Exit code 0 if all decisions are the same, 1 if one differs or the file is broken; the message
+/// names the line.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -17,24 +18,27 @@ Examples:
   slabcast render brain.nii.gz --workers 4 --record events.log
   slabcast lab replay events.log")]
 pub struct ReplayArgs {
-    /// What --record wrote; FILE.part of a master that was killed will do
+    /// File that --record wrote, or the FILE.part of a master that was killed
     file: PathBuf,
     /// As JSON
     #[arg(long)]
     json: bool,
 }
 
-/// Runs `slabcast lab replay`.
+/// Runs `slabcast lab replay`: prints the numbers of events and decisions, or JSON with `--json`.
+///
+/// # Errors
+/// The file can't be read, a line of it is no event, or a decision differs from the recorded one.
 pub fn run(args: &ReplayArgs) -> Result<(), Fail> {
     let shown = args.file.display().to_string();
     let file = File::open(&args.file).map_err(|e| Fail::io(&args.file, "opening", &e))?;
-    // A thread of its own: what the scheduler does not stand of a forged file ends it alone.
+    // In its own thread, since a forged file may make the scheduler panic.
     let replaying = std::thread::spawn(move || replay(BufReader::with_capacity(1 << 18, file)));
     let done = match replaying.join() {
         Ok(done) => done,
         Err(_) => {
             return Err(Fail::failed(format!(
-                "{shown}: the scheduler can't go on with what it says; no master wrote that"
+                "{shown}: the scheduler panicked on it; give an unaltered file that --record wrote"
             )));
         }
     };

@@ -1,5 +1,4 @@
-//! One view of one volume, for commands that look closely at a single picture: `error` and
-//! `explain`.
+//! One view of one volume, for the commands about a single picture: `error` and `explain`.
 
 use crate::autotune::choose::settle;
 use slabcast_common::image::{Background, Picture};
@@ -17,47 +16,49 @@ use std::sync::Arc;
 
 /// The first view of a path, ready to be drawn and judged.
 pub(crate) struct SingleFrame {
-    /// Sums decided.
+    /// Scene, with the arithmetic of its sums decided.
     pub(crate) spec: SceneSpec,
+    /// View of the picture at full size.
     pub(crate) view: View,
-    /// What is drawn, and how many times it is magnified.
-    small: View,
+    /// View that is drawn, and the factor it is magnified by.
+    drawn_view: View,
     magnify: u32,
     pub(crate) bricks: Bricks,
     pub(crate) background: Background,
 }
 
 impl SingleFrame {
-    /// Reads the volume and cuts its bricks. `check` is asked before anything is read.
+    /// Reads the volume and cuts its bricks. `check` may refuse the size of the picture, in pixels,
+    /// before anything is read.
     pub(crate) fn read(
-        of: &VolumeSceneArgs,
+        args: &VolumeSceneArgs,
         threads: usize,
         check: impl FnOnce([u32; 2]) -> Result<(), Fail>,
     ) -> Result<SingleFrame, Fail> {
-        let mut request = of.scene.request_with_target(Work::default())?;
+        let mut request = args.scene.request_with_target(Work::default())?;
         check(request.path.size)?;
-        let OpenedVolume { volume, info, orientation } = of.open(&request)?;
+        let OpenedVolume { volume, info, orientation } = args.open(&request)?;
         let volume = Arc::new(volume);
         settle(&volume, &info, &mut request, orientation, threads)?;
-        let stage = PathScenes::new(&volume, &info, &request, orientation)?;
-        let (spec, small) = (stage.spec(0), stage.view(0, &request.quality)?);
-        let view = stage.view_at_size(0, &request.quality, request.size())?;
+        let scenes = PathScenes::new(&volume, &info, &request, orientation)?;
+        let (spec, drawn_view) = (scenes.spec(0), scenes.view(0, &request.quality)?);
+        let view = scenes.view_at_size(0, &request.quality, request.size())?;
         let (background, magnify) = (request.background, request.magnify);
-        Ok(SingleFrame { spec, view, small, magnify, bricks: stage.bricks, background })
+        Ok(SingleFrame { spec, view, drawn_view, magnify, bricks: scenes.bricks, background })
     }
 
-    /// The frame at another quality (the same sheets and kernel).
+    /// Returns the frame at another quality with the same sheets and kernel.
     pub(crate) fn frame(&self, quality: Quality) -> Frame {
         let spec = SceneSpec { quality, ..self.spec.clone() };
-        Frame::new(Arc::new(Scene::new(&spec)), self.small)
+        Frame::new(Arc::new(Scene::new(&spec)), self.drawn_view)
     }
 
-    /// The picture at another quality (the same sheets and kernel).
+    /// Draws the picture at another quality with the same sheets and kernel.
     pub(crate) fn draw(&self, quality: Quality, threads: usize) -> Picture {
         self.draw_frame(&self.frame(quality), threads)
     }
 
-    /// The picture with no pixel ever shut.
+    /// Draws the picture with no pixel ever shut.
     pub(crate) fn draw_open(&self, threads: usize) -> Picture {
         self.draw_frame(&self.frame(self.spec.quality).never_shut(), threads)
     }
@@ -67,7 +68,7 @@ impl SingleFrame {
         magnified(picture, self.magnify, threads)
     }
 
-    /// What judges it.
+    /// Returns the reference for the picture at full size.
     pub(crate) fn reference(&self) -> Reference {
         Reference::new(&self.spec, self.view, &self.bricks)
     }

@@ -1,19 +1,19 @@
 //! Statistics that more than one experiment reports.
 
-/// Spearman's rank correlation of pairs; ties share the mean of their ranks. `None` of fewer than
-/// three pairs, or where one side is all the same.
+/// Returns Spearman's rank correlation of pairs, from -1 to 1. Ties share the mean of their ranks.
+/// `None` for fewer than three pairs, or if all values of one side are equal.
 pub(crate) fn spearman(pairs: &[(f64, f64)]) -> Option<f64> {
     let n = pairs.len();
     if n < 3 {
         return None;
     }
-    let ranks = |of: &dyn Fn(usize) -> f64| {
+    let ranks = |value: &dyn Fn(usize) -> f64| {
         let mut order: Vec<usize> = (0..n).collect();
-        order.sort_by(|&a, &b| of(a).total_cmp(&of(b)));
+        order.sort_by(|&a, &b| value(a).total_cmp(&value(b)));
         let mut ranks = vec![0.0; n];
         let mut i = 0;
         while i < n {
-            let same = order[i..].iter().take_while(|&&j| of(j) == of(order[i])).count();
+            let same = order[i..].iter().take_while(|&&j| value(j) == value(order[i])).count();
             for &j in &order[i..i + same] {
                 ranks[j] = i as f64 + (same as f64 - 1.0) / 2.0;
             }

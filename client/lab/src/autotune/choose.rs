@@ -171,7 +171,7 @@ impl Climb<'_> {
                 _ => ("error-max", most * MAX_ERROR_MARGIN),
             };
             return Err(Fail::usage(format!(
-                "--{flag}: no setting is so exact in this scene; the best one can promise \
+                "--{flag}: no setting comes so near the truth in this scene; the best can promise \
                  {:.3}/255: give {:.5} or more",
                 least,
                 least / 255.0 * 1.005
@@ -243,7 +243,7 @@ pub fn choose(bed: &mut dyn TestBed, target: &QualityTarget, quiet: bool) -> Res
     progress.phase("choosing a setting");
     if known == 0 && !quiet {
         progress::note(&format!(
-            "{}: measuring this scene first; the result is kept for the next time",
+            "{}: this scene is measured first; the result is kept for the next time",
             target.flags()
         ));
     }

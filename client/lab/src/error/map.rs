@@ -1,10 +1,10 @@
-//! Where the error is: the picture and, beside it, its error in false colours.
+//! The error map: the picture and, beside it, its error in false colours.
 //!
-//! The colour of a pixel is the largest error of its four channels against the limit, on a scale
-//! that is always the same, so that maps can be compared: logarithmic, from 0.01 to 10 of 1/255.
-//! A sample is shown as what it is: each cell as one block, in the colour of its one pixel.
+//! The colour of a pixel is the largest error of its four channels against the limit. The scale is
+//! always the same, so that maps can be compared: logarithmic, from 0.01 to 10 of 1/255. Each cell
+//! of the sample is drawn as one block, in the colour of its one pixel.
 
-use super::Found;
+use super::ErrorResult;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::occlusion::Rect;
 use slabcast_render::judge::reference::grid_cells;
@@ -16,17 +16,17 @@ use std::path::Path;
 /// Ends of the scale in 1/255. Three decades: at 0.01 a pixel is as good as exact in any 8-bit
 /// picture, and only one in a thousand of the worst view measured was above 10.
 const SCALE: [f64; 2] = [0.01, 10.0];
-/// Neither picture nor limit shows anything there. No grey is on the scale.
+/// Colour of a pixel that is blank in both picture and limit. The scale has no grey.
 const BLANK: [u8; 3] = [96; 3];
-/// Beyond the scale, or not finite.
+/// Colour of an error beyond the scale, or not finite.
 const OVER: [u8; 3] = WHITE;
-/// Between the two pictures and around the scale.
+/// Pixels between the two pictures and around the scale.
 const GAP: usize = 8;
 const BAR: usize = 10;
-/// Pixels of a digit's dot.
+/// Edge of a dot of the digits, in pixels.
 const DOT: usize = 2;
-/// Narrower canvases have a scale without numbers.
-const NUMBERED: usize = 160;
+/// Least width of a canvas whose scale has numbers, in pixels.
+const LEAST_NUMBERED_WIDTH: usize = 160;
 
 /// Refuses a map that would overwrite the volume.
 pub(super) fn check(map: &Path, volume: &Path) -> Result<(), Fail> {
@@ -41,22 +41,22 @@ pub(super) fn check(map: &Path, volume: &Path) -> Result<(), Fail> {
     }
 }
 
-/// The error at each pixel of the sample, in 1/255; `None` where nothing is to be seen.
-fn errors(found: &Found) -> Vec<Option<f64>> {
-    let w = found.picture.size[0] as usize;
+/// Returns the error at each pixel of the sample, in 1/255; `None` for a blank pixel.
+fn errors(result: &ErrorResult) -> Vec<Option<f64>> {
+    let w = result.picture.size[0] as usize;
     let one = |(&[x, y], want): (&[u32; 2], &[f64; 4])| {
-        let got = found.picture.pixels[y as usize * w + x as usize].map(f64::from);
+        let got = result.picture.pixels[y as usize * w + x as usize].map(f64::from);
         if got[3] <= 0.0 && want[3] <= 0.0 {
             return None;
         }
         let off = |c: usize| (got[c] - want[c]).abs() * 255.0;
-        // `max` would pass over what is not a number.
+        // `f64::max` would ignore NaN.
         Some((0..4).map(off).fold(0.0, |a, b| if a >= b { a } else { b }))
     };
-    found.sample.iter().zip(&found.limit).map(one).collect()
+    result.sample.iter().zip(&result.limit).map(one).collect()
 }
 
-/// Colour of an error in 1/255.
+/// Returns the colour of an error in 1/255.
 fn colour(error: Option<f64>) -> [u8; 3] {
     let Some(e) = error else { return BLANK };
     let [lo, hi] = SCALE;
@@ -66,7 +66,7 @@ fn colour(error: Option<f64>) -> [u8; 3] {
     viridis(libm::log(e.max(lo) / lo) / libm::log(hi / lo))
 }
 
-/// The picture left, its error right, the scale below.
+/// Draws the picture at the left, its error at the right, the scale below.
 fn draw(picture: &Picture, background: Background, blocks: &[(Rect, [u8; 3])]) -> Canvas {
     let [w, h] = picture.size.map(|n| n as usize);
     let width = 2 * w + GAP;
@@ -82,7 +82,7 @@ fn draw(picture: &Picture, background: Background, blocks: &[(Rect, [u8; 3])]) -
         let e = lo * libm::exp((x as f64 + 0.5) / width as f64 * all);
         canvas.fill([x, bar], [1, BAR], colour(Some(e)));
     }
-    if width >= NUMBERED {
+    if width >= LEAST_NUMBERED_WIDTH {
         for (i, text) in ["0.01", "0.1", "1", "10"].into_iter().enumerate() {
             let long = canvas::width(text, DOT);
             let x = (width - 1) * i / 3;
@@ -95,19 +95,19 @@ fn draw(picture: &Picture, background: Background, blocks: &[(Rect, [u8; 3])]) -
 }
 
 /// Writes the map, whole or not at all.
-pub(super) fn write(path: &Path, found: &Found) -> Result<(), Fail> {
-    let cells = grid_cells(found.picture.size, found.sample.len());
+pub(super) fn write(path: &Path, result: &ErrorResult) -> Result<(), Fail> {
+    let cells = grid_cells(result.picture.size, result.sample.len());
     let blocks: Vec<_> =
-        cells.into_iter().zip(errors(found)).map(|(cell, e)| (cell, colour(e))).collect();
-    let canvas = draw(&found.picture, found.still.background, &blocks);
-    let figures = found.whole[0].figures;
+        cells.into_iter().zip(errors(result)).map(|(cell, e)| (cell, colour(e))).collect();
+    let canvas = draw(&result.picture, result.scene.background, &blocks);
+    let figures = result.whole[0].figures;
     let about = [
         ("slabcast lab error scale", scale()),
         (
             "slabcast lab error figures",
             format!("RMSE {} max {} of 1/255", figures.rmse, figures.max),
         ),
-        ("slabcast pixels_sha256", found.picture.sha256().to_string()),
+        ("slabcast pixels_sha256", result.picture.sha256().to_string()),
     ];
     write_atomic(path, |out| canvas.png(out, &about))
 }
@@ -120,9 +120,9 @@ fn scale() -> String {
     )
 }
 
-/// A line that says what the map shows.
-pub(super) fn caption(path: &Path, found: &Found) -> String {
-    let all = found.sample.len() == found.picture.pixels.len();
+/// Returns a line that explains the map.
+pub(super) fn caption(path: &Path, result: &ErrorResult) -> String {
+    let all = result.sample.len() == result.picture.pixels.len();
     let blocks = if all { "" } else { "; a block is a pixel of the sample (--pixels all: each)" };
     format!("map: {}: {}{blocks}\n", path.display(), scale())
 }

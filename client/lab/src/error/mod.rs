@@ -1,15 +1,14 @@
-//! `slabcast lab error`: how far a picture is from the truth, and why.
+//! `slabcast lab error`: measures the error of a picture and the share of each source.
 //!
 //! The truth is the reference (a gather in f64 along true rays, which shares nothing with the
-//! splatter) at a stratified sample of pixels, or at all. Sources are found by switching the
-//! others off: each row of the table compares two pictures that differ in that source alone.
+//! splatter) at a stratified sample of pixels, or at all. Each row of the table compares two
+//! pictures that differ in one source of error alone.
 //!
-//! Two kinds of sources. Thickness, cut-off, slivers, quantisation and rounding lie between a
-//! picture and the limit, and add up to its error. Truncation and ripple lie between the limit and
-//! an ideal: they are errors of the model, stand beside the sum, and no quality but the kernel's
-//! changes them.
+//! There are two kinds of sources. Thickness, cut-off, slivers, quantisation and rounding lie between
+//! the picture and the limit, and add up to its error. Truncation and ripple lie between the limit
+//! and an ideal. They are errors of the model, no part of the sum, and depend on the kernel only.
 //!
-//! [`report`] says it as text or JSON, [`map`] as a picture.
+//! [`report`] prints the result as text or JSON, [`map`] draws it.
 
 mod map;
 mod report;
@@ -27,13 +26,13 @@ use slabcast_session::{parse, signals};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-/// Tolerance of the reference for those, looser than the judge's own by 100: pixels are then off
-/// by some 0.001/255, where truncation and ripple begin at 0.01, for half the kernel values.
+/// Tolerance of the reference for truncation and ripple, 100 times the judge's own. It halves the
+/// kernel values for errors of some 0.001/255, where truncation and ripple begin at 0.01.
 const MODEL_TOLERANCE: f64 = 1e-5;
 
 /// Measures how far a picture is from the truth.
 ///
-/// In 1/255, and what the error is made of.
+/// Prints the error in 1/255 and the share of each source.
 ///
 /// The first view of the path is rendered and compared, at a stratified sample of pixels, with a
 /// reference that integrates along true rays in double precision. Errors are of linear
@@ -73,7 +72,7 @@ pub struct ErrorArgs {
     /// translucent they are a rough estimate: truncation is large on silhouettes alone
     #[arg(long, value_name = "N|all", default_value = "512", value_parser = parse::pixels)]
     model_pixels: Pixels,
-    /// Which sample of pixels
+    /// Seed of the sample of pixels
     #[arg(long, value_name = "N", default_value = "1")]
     seed: u64,
     /// Writes the picture and, beside it, where its error is: in colours from 0.01 to 10 of 1/255
@@ -87,93 +86,100 @@ pub struct ErrorArgs {
     json: bool,
 }
 
-/// One comparison.
+/// One comparison of two pictures: a row of the table.
 struct Row {
     name: &'static str,
     what: &'static str,
     figures: ErrorFigures,
 }
 
-/// All that was found out.
-struct Found {
-    still: SingleFrame,
+/// Result of the command.
+struct ErrorResult {
+    scene: SingleFrame,
     picture: Picture,
-    /// Pixels looked at, and what the limit is there.
+    /// Coordinates of the pixels compared, and the limit at each.
     sample: Vec<[u32; 2]>,
     limit: Vec<[f64; 4]>,
-    /// The whole, and that at the same thickness.
+    /// Errors against the limit, and against sheets of the same thickness.
     whole: [Row; 2],
-    /// What lies between the picture and the limit: adds up to the whole.
+    /// Sources of error between picture and limit, which add up to the error against the limit.
     sources: [Row; 5],
-    /// Rounding, parted.
+    /// The two parts of rounding.
     rounding: [Row; 2],
-    /// What lies between the limit and an ideal.
+    /// Errors of the model, between the limit and an ideal.
     model: [Row; 2],
-    /// Pixels looked at for that.
+    /// Number of pixels compared for `model`.
     sampled_model: usize,
     drawn: Duration,
     judged: Duration,
     total: Duration,
 }
 
-/// Runs the command.
+/// Runs `slabcast lab error`: prints the table, or JSON with `--json`, and writes the map.
+///
+/// # Errors
+/// The arguments or the volume are refused, the map can't be written, or the user stopped it.
 pub fn run(args: &ErrorArgs) -> Result<(), Fail> {
     if let Some(map) = &args.map {
         map::check(map, &args.of.volume)?;
     }
-    let found = {
+    let result = {
         let args = args.clone();
-        signals::run_unless_stopped(move || find(&args))?
+        signals::run_unless_stopped(move || measure(&args))?
     };
     if let Some(path) = &args.map {
-        map::write(path, &found)?;
+        map::write(path, &result)?;
     }
-    say(&if args.json { report::json(&found, args.map.as_deref()) } else { report::text(&found) })?;
+    say(&if args.json {
+        report::json(&result, args.map.as_deref())
+    } else {
+        report::text(&result)
+    })?;
     match &args.map {
-        Some(path) if !args.json => say(&map::caption(path, &found)),
+        Some(path) if !args.json => say(&map::caption(path, &result)),
         _ => Ok(()),
     }
 }
 
-/// Whether any pixel was shut. Opacity never falls, so the finished one tells.
-fn shut(picture: &Picture, eps: f64) -> bool {
+/// Returns whether any pixel was shut, by its final opacity, since opacity never falls.
+fn any_shut(picture: &Picture, eps: f64) -> bool {
     picture.pixels.iter().any(|p| 1.0 - p[3] < eps as f32)
 }
 
-fn find(args: &ErrorArgs) -> Result<Found, Fail> {
+fn measure(args: &ErrorArgs) -> Result<ErrorResult, Fail> {
     let threads = args.threads.count();
-    let still = SingleFrame::read(&args.of, threads, |_| Ok(()))?;
-    let size = still.view.size;
+    let scene = SingleFrame::read(&args.of, threads, |_| Ok(()))?;
+    let size = scene.view.size;
 
     let mut progress = Progress::new(false).counting("pixel");
     let began = Instant::now();
     progress.phase("drawing");
-    let quality = still.spec.quality;
-    let picture = still.draw(quality, threads);
+    let quality = scene.spec.quality;
+    let picture = scene.draw(quality, threads);
     let drawn = began.elapsed();
-    // What nothing tells apart need not be drawn twice.
+    // Pictures that cannot differ are drawn once.
     let open = Quality { eps: 0.0, ..quality };
     let floats = Quality { sums: Sums::F32, ..open };
-    let opened = shut(&picture, quality.eps).then(|| still.draw_open(threads));
+    let opened = any_shut(&picture, quality.eps).then(|| scene.draw_open(threads));
     let opened = opened.as_ref().unwrap_or(&picture);
-    // Sums of 32 bits that may lose nothing give no sliver away.
-    let entire = (open != quality && quality.sums == Sums::I32).then(|| still.draw(open, threads));
+    // With eps 0, sums of 32 bits move no sliver to the next sheet.
+    let entire = (open != quality && quality.sums == Sums::I32).then(|| scene.draw(open, threads));
     let entire = entire.as_ref().unwrap_or(opened);
-    let floated = (floats != open).then(|| still.draw(floats, threads));
+    let floated = (floats != open).then(|| scene.draw(floats, threads));
     let floated = floated.as_ref().unwrap_or(entire);
 
     let sample = stratified(size, args.pixels.count(size), args.seed);
     let model = stratified(size, sample.len().min(args.model_pixels.count(size)), args.seed);
     let all = (sample.len() + model.len()) as u64;
     progress.frames(all, &format!("{} pixels of the reference", sample.len()));
-    let reference = still.reference();
+    let reference = scene.reference();
     let judging = Instant::now();
     let rounded = SheetOptions { rounded: true, ..SheetOptions::default() };
     let truth = direct::map_pixels(&sample, threads, (&mut progress, 0), |[x, y]| {
         let limit = reference.pixel(x, y);
         [limit, reference.at_same_thickness(x, y), reference.by_sheets(x, y, rounded)]
     });
-    let judge = || still.reference().with_tolerance(MODEL_TOLERANCE);
+    let judge = || scene.reference().with_tolerance(MODEL_TOLERANCE);
     let (limit, whole, level) = (judge(), judge().without_truncation(), judge().without_ripple());
     let ideals = direct::map_pixels(&model, threads, (&mut progress, sample.len()), |[x, y]| {
         [limit.pixel(x, y), whole.pixel(x, y), level.pixel(x, y)]
@@ -182,10 +188,10 @@ fn find(args: &ErrorArgs) -> Result<Found, Fail> {
     progress.end();
 
     let plane =
-        |of: &[[[f64; 4]; 3]], i: usize| -> Vec<[f64; 4]> { of.iter().map(|t| t[i]).collect() };
+        |all: &[[[f64; 4]; 3]], i: usize| -> Vec<[f64; 4]> { all.iter().map(|t| t[i]).collect() };
     let [limit, sheets, rounded] = [0, 1, 2].map(|i| plane(&truth, i));
     let [model_limit, whole_kernel, level] = [0, 1, 2].map(|i| plane(&ideals, i));
-    let at = |p: &Picture| -> Vec<[f32; 4]> {
+    let sampled = |p: &Picture| -> Vec<[f32; 4]> {
         sample.iter().map(|&[x, y]| p.pixels[y as usize * size[0] as usize + x as usize]).collect()
     };
     let narrow =
@@ -194,10 +200,11 @@ fn find(args: &ErrorArgs) -> Result<Found, Fail> {
     let row = |name, what, got: &[[f32; 4]], want: &[[f64; 4]]| Row {
         name,
         what,
-        figures: ErrorFigures::compare(got, want, still.background),
+        figures: ErrorFigures::compare(got, want, scene.background),
     };
-    let (got, opened, entire, floated) = (at(&picture), at(opened), at(entire), at(floated));
-    let found = Found {
+    let (got, opened, entire, floated) =
+        (sampled(&picture), sampled(opened), sampled(entire), sampled(floated));
+    let result = ErrorResult {
         whole: [
             row("limit", "against the limit: all of it", &got, &limit),
             row("same_thickness", "against the same sheets in f64, nothing shut", &got, &sheets),
@@ -219,12 +226,12 @@ fn find(args: &ErrorArgs) -> Result<Found, Fail> {
         ],
         sampled_model: model.len(),
         total: began.elapsed(),
-        still,
+        scene,
         picture,
         sample,
         limit,
         drawn,
         judged,
     };
-    Ok(found)
+    Ok(result)
 }

@@ -1,19 +1,19 @@
-//! What was found, as text and as JSON.
+//! The result as text and as JSON.
 
-use super::{Found, Row};
+use super::{ErrorResult, Row};
 use slabcast_session::progress;
 use std::fmt::Write;
 use std::path::Path;
 
-/// The sources against the whole: root of the sum of squares, and plain sum. Independent errors
-/// add up to the first; the second is never passed by the RMSE of their sum.
-fn sums(found: &Found) -> [f64; 2] {
-    let rmse = || found.sources.iter().map(|r| r.figures.rmse);
+/// Returns the RMSE of all sources together: root of the sum of squares, and plain sum. Independent
+/// errors add up to the first; the second is an upper bound.
+fn sums(result: &ErrorResult) -> [f64; 2] {
+    let rmse = || result.sources.iter().map(|r| r.figures.rmse);
     [rmse().map(|x| x * x).sum::<f64>().sqrt(), rmse().sum()]
 }
 
-/// For people.
-pub(super) fn text(found: &Found) -> String {
+/// Returns the result as a table.
+pub(super) fn text(result: &ErrorResult) -> String {
     let mut out = String::from("in 1/255           RMSE      max   off by > 1   8-bit RMSE\n");
     let put = |out: &mut String, r: &Row| {
         let name = match r.name.split_once('_') {
@@ -32,35 +32,35 @@ pub(super) fn text(found: &Found) -> String {
             r.what
         );
     };
-    found.whole.iter().for_each(|r| put(&mut out, r));
+    result.whole.iter().for_each(|r| put(&mut out, r));
     out.push_str("made of\n");
-    found.sources.iter().chain(&found.rounding).for_each(|r| put(&mut out, r));
-    let [squares, plain] = sums(found);
+    result.sources.iter().chain(&result.rounding).for_each(|r| put(&mut out, r));
+    let [squares, plain] = sums(result);
     let _ = writeln!(
         out,
         "together       {:>8}   (root of the sum of squares; the plain sum is {}); measured {}",
         number(squares),
         number(plain),
-        number(found.whole[0].figures.rmse)
+        number(result.whole[0].figures.rmse)
     );
     out.push_str("beside it, the limit against an ideal\n");
-    found.model.iter().for_each(|r| put(&mut out, r));
+    result.model.iter().for_each(|r| put(&mut out, r));
     let _ = writeln!(
         out,
         "{} pixels that are not blank, of {} looked at ({} for truncation and ripple), of {}; \
          drawn in {}, judged in {}, {} in all",
-        found.whole[0].figures.n_pixels,
-        found.sample.len(),
-        found.sampled_model,
-        found.picture.pixels.len(),
-        progress::time(found.drawn),
-        progress::time(found.judged),
-        progress::time(found.total)
+        result.whole[0].figures.n_pixels,
+        result.sample.len(),
+        result.sampled_model,
+        result.picture.pixels.len(),
+        progress::time(result.drawn),
+        progress::time(result.judged),
+        progress::time(result.total)
     );
     out
 }
 
-/// Three digits or so.
+/// Formats a number with about three digits.
 pub(super) fn number(x: f64) -> String {
     if x == 0.0 {
         "0".into()
@@ -73,10 +73,11 @@ pub(super) fn number(x: f64) -> String {
     }
 }
 
-/// For programs.
-pub(super) fn json(found: &Found, map: Option<&Path>) -> String {
+/// Returns the result as JSON.
+pub(super) fn json(result: &ErrorResult, map: Option<&Path>) -> String {
     let mut out = serde_json::Map::new();
-    let rows = found.whole.iter().chain(&found.sources).chain(&found.rounding).chain(&found.model);
+    let rows =
+        result.whole.iter().chain(&result.sources).chain(&result.rounding).chain(&result.model);
     for r in rows {
         let f = &r.figures;
         let figures = serde_json::json!({
@@ -85,20 +86,20 @@ pub(super) fn json(found: &Found, map: Option<&Path>) -> String {
         });
         out.insert(r.name.into(), figures);
     }
-    let [squares, plain] = sums(found);
-    let measured = found.whole[0].figures.rmse;
+    let [squares, plain] = sums(result);
+    let measured = result.whole[0].figures.rmse;
     out.insert(
         "sum".into(),
         serde_json::json!({"squares": squares, "plain": plain, "measured": measured}),
     );
-    out.insert("sampled".into(), found.sample.len().into());
-    out.insert("sampled_model".into(), found.sampled_model.into());
-    out.insert("size".into(), found.picture.size.to_vec().into());
-    out.insert("pixels_sha256".into(), found.picture.sha256().to_string().into());
-    let quality = serde_json::to_value(found.still.spec.quality).unwrap_or_default();
+    out.insert("sampled".into(), result.sample.len().into());
+    out.insert("sampled_model".into(), result.sampled_model.into());
+    out.insert("size".into(), result.picture.size.to_vec().into());
+    out.insert("pixels_sha256".into(), result.picture.sha256().to_string().into());
+    let quality = serde_json::to_value(result.scene.spec.quality).unwrap_or_default();
     out.insert("quality".into(), quality);
     for (name, time) in
-        [("draw_ms", found.drawn), ("judge_ms", found.judged), ("total_ms", found.total)]
+        [("draw_ms", result.drawn), ("judge_ms", result.judged), ("total_ms", result.total)]
     {
         out.insert(name.into(), (time.as_secs_f64() * 1e3).into());
     }

@@ -1,9 +1,8 @@
 //! Charts as SVG and as PNG, on a light and on a dark ground.
 //!
-//! By plotters, as [`crate::plot`]: its SVG writer, and its bitmap writer with a font that is part
-//! of the program, since a cluster's node may have none. What is drawn is one function over both;
-//! [`Sheet`] hides which, and how large a pixel is. Text is measured by the same font, so labels
-//! keep apart in both.
+//! Drawn by plotters: its SVG writer, and its bitmap writer with a font that is part of the program,
+//! since a node of a cluster may have none. One drawing function serves both; [`Sheet`] hides the
+//! writer and the size of a pixel. Text is measured in the same font, so that labels never overlap.
 
 use ab_glyph::{Font, FontRef, ScaleFont};
 use plotters::coord::Shift;
@@ -17,29 +16,30 @@ use std::sync::Once;
 
 static FONT: &[u8] = include_bytes!("../fonts/DejaVuSans.ttf");
 
-/// What SVG viewers look for, the first being that of the PNGs.
+/// Font families for SVG viewers; the first is that of the PNGs.
 const FAMILY: &str = "DejaVu Sans, Verdana, sans-serif";
 
-/// Pixels of a PNG for one of the SVG. One looks coarse on today's screens.
+/// Pixels of the PNG for one of the SVG along each edge. At 1, charts look coarse on screens.
 const PNG_SCALE: u32 = 2;
 
-/// Points drawn for one of a PNG along each edge, which smooths lines; plotters' own are jagged.
+/// Pixels drawn for one of the PNG along each edge. Smooths lines, which plotters draws jagged.
 const SMOOTH: u32 = 2;
 
 type Failed = Box<dyn std::error::Error + Send + Sync>;
 
-/// Colours of a ground.
+/// Colours for a light or dark background.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Theme {
     pub(crate) ground: RGBColor,
     pub(crate) ink: RGBColor,
     pub(crate) faint: RGBColor,
     pub(crate) grid: RGBColor,
-    /// For up to eight kinds of things. Okabe and Ito's, which most colour-blind readers tell apart,
-    /// darkened or lightened for the ground.
+    /// Colours of up to eight series: those of Okabe and Ito, which most colour-blind readers can tell
+    /// apart, darkened or lightened for the background.
     pub(crate) colours: [RGBColor; 8],
 }
 
+/// Colours for a light background.
 pub(crate) const LIGHT: Theme = Theme {
     ground: RGBColor(253, 253, 250),
     ink: RGBColor(32, 34, 38),
@@ -57,6 +57,7 @@ pub(crate) const LIGHT: Theme = Theme {
     ],
 };
 
+/// Colours for a dark background.
 pub(crate) const DARK: Theme = Theme {
     ground: RGBColor(24, 26, 30),
     ink: RGBColor(236, 236, 232),
@@ -74,24 +75,24 @@ pub(crate) const DARK: Theme = Theme {
     ],
 };
 
-/// What draws a chart: on any writer, in units of one SVG pixel.
+/// A chart that can be drawn by any writer, in units of one SVG pixel.
 pub(crate) trait Draw {
-    /// Width and height.
+    /// Returns width and height in pixels.
     fn size(&self) -> (u32, u32);
 
-    /// Draws it.
+    /// Draws the chart.
     fn draw<DB: DrawingBackend>(&self, on: &Sheet<'_, DB>, theme: &Theme) -> Result<(), Failed>
     where
         DB::ErrorType: 'static;
 }
 
-/// A ground to draw on.
+/// The area that a chart is drawn on.
 pub(crate) struct Sheet<'a, DB: DrawingBackend> {
     area: &'a DrawingArea<DB, Shift>,
     scale: f64,
 }
 
-/// Which part of a text stands at its place.
+/// The part of a text that is at its position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Anchor {
     Left,
@@ -99,7 +100,7 @@ pub(crate) enum Anchor {
     Right,
 }
 
-/// What a point looks like.
+/// Shape of a point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Mark {
     Dot,
@@ -113,27 +114,29 @@ impl<DB: DrawingBackend> Sheet<'_, DB>
 where
     DB::ErrorType: 'static,
 {
-    fn at(&self, (x, y): (f64, f64)) -> (i32, i32) {
+    /// Converts a position to pixels of the writer.
+    fn pixel(&self, (x, y): (f64, f64)) -> (i32, i32) {
         ((x * self.scale).round() as i32, (y * self.scale).round() as i32)
     }
 
-    fn long(&self, x: f64) -> u32 {
+    /// Converts a length to pixels of the writer, at least one.
+    fn pixels_long(&self, x: f64) -> u32 {
         (x * self.scale).round().max(1.0) as u32
     }
 
-    /// A line through points, `wide` pixels wide.
+    /// Draws a line through points, `wide` pixels wide.
     pub(crate) fn line(
         &self,
         points: &[(f64, f64)],
         wide: f64,
         colour: RGBColor,
     ) -> Result<(), Failed> {
-        let points: Vec<_> = points.iter().map(|&p| self.at(p)).collect();
-        self.area.draw(&PathElement::new(points, colour.stroke_width(self.long(wide))))?;
+        let points: Vec<_> = points.iter().map(|&p| self.pixel(p)).collect();
+        self.area.draw(&PathElement::new(points, colour.stroke_width(self.pixels_long(wide))))?;
         Ok(())
     }
 
-    /// A mark about a point.
+    /// Draws a mark of radius `r` around a point.
     pub(crate) fn mark(
         &self,
         mark: Mark,
@@ -142,12 +145,16 @@ where
         colour: RGBColor,
     ) -> Result<(), Failed> {
         let poly = |points: &[(f64, f64)]| {
-            let points = points.iter().map(|p| self.at((x + p.0 * r, y + p.1 * r)));
+            let points = points.iter().map(|p| self.pixel((x + p.0 * r, y + p.1 * r)));
             Polygon::new(points.collect::<Vec<_>>(), colour.filled())
         };
         match mark {
             Mark::Dot => {
-                self.area.draw(&Circle::new(self.at((x, y)), self.long(r), colour.filled()))?;
+                self.area.draw(&Circle::new(
+                    self.pixel((x, y)),
+                    self.pixels_long(r),
+                    colour.filled(),
+                ))?;
             }
             Mark::Square => {
                 let q = 0.86;
@@ -167,14 +174,14 @@ where
         Ok(())
     }
 
-    /// A filled rectangle.
+    /// Draws a filled rectangle.
     pub(crate) fn bar(&self, own: &Box2, colour: RGBColor) -> Result<(), Failed> {
-        let ends = [self.at((own.x0, own.y0)), self.at((own.x1, own.y1))];
+        let ends = [self.pixel((own.x0, own.y0)), self.pixel((own.x1, own.y1))];
         self.area.draw(&Rectangle::new(ends, colour.filled()))?;
         Ok(())
     }
 
-    /// A ring about a point.
+    /// Draws a ring of radius `r` around a point.
     pub(crate) fn ring(&self, at: (f64, f64), r: f64, colour: RGBColor) -> Result<(), Failed> {
         let turn = |i: i32| {
             let (s, c) = libm::sincos(f64::from(i) * std::f64::consts::TAU / 48.0);
@@ -183,7 +190,7 @@ where
         self.line(&(0..=48).map(turn).collect::<Vec<_>>(), 1.8, colour)
     }
 
-    /// A line of text whose letters stand on `y`.
+    /// Draws a line of text with its base line at `y`.
     pub(crate) fn text(
         &self,
         text: &str,
@@ -205,11 +212,11 @@ where
             plotters::style::text_anchor::HPos::Left,
             plotters::style::text_anchor::VPos::Bottom,
         ));
-        self.area.draw(&Text::new(text.to_owned(), self.at((left, y + size * 0.22)), style))?;
+        self.area.draw(&Text::new(text.to_owned(), self.pixel((left, y + size * 0.22)), style))?;
         Ok(())
     }
 
-    /// The same upwards, its middle at a place.
+    /// Draws a line of text upwards, its middle at a position.
     pub(crate) fn upwards(
         &self,
         text: &str,
@@ -222,15 +229,15 @@ where
             plotters::style::text_anchor::HPos::Center,
             plotters::style::text_anchor::VPos::Center,
         ));
-        self.area.draw(&Text::new(text.to_owned(), self.at((x, y)), style))?;
+        self.area.draw(&Text::new(text.to_owned(), self.pixel((x, y)), style))?;
         Ok(())
     }
 }
 
-/// Width of a text in pixels.
+/// Returns the width of a text in pixels.
 pub(crate) fn width(text: &str, size: f64) -> f64 {
     let Ok(font) = FontRef::try_from_slice(FONT) else { return text.len() as f64 * size * 0.6 };
-    // A size is that of the em, a scale is the font's height.
+    // `size` is that of the em; `as_scaled` takes the height of the font.
     let em = font.units_per_em().unwrap_or(2048.0);
     let font = font.as_scaled(size as f32 * font.height_unscaled() / em);
     text.chars().map(|c| f64::from(font.h_advance(font.glyph_id(c)))).sum()
@@ -246,6 +253,7 @@ pub(crate) struct Box2 {
 }
 
 impl Box2 {
+    /// Returns the square of half-width `r` around a point.
     pub(crate) fn about((x, y): (f64, f64), r: f64) -> Box2 {
         Box2 { x0: x - r, y0: y - r, x1: x + r, y1: y + r }
     }
@@ -259,8 +267,8 @@ impl Box2 {
     }
 }
 
-/// Where a label of a point may stand so that it covers nothing in `taken` and stays in `room`: the
-/// left end of its base line, and its box. Near places are tried first.
+/// Returns a position for the label of a point that stays in `room` and covers nothing in `taken`: the
+/// left end of its base line, and its box. Near positions are tried first.
 pub(crate) fn place(
     text: &str,
     size: f64,
@@ -303,20 +311,20 @@ pub(crate) fn place(
     None
 }
 
-/// The font of all words, ready to be measured and drawn.
+/// Registers the font on first use and returns its family.
 pub(crate) fn family() -> &'static str {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
-        // A font that can't be read fails whatever draws; tests draw.
+        // If registering fails, drawing fails, too, and tests would see it.
         let _ = register_font(FAMILY, FontStyle::Normal, FONT);
     });
     FAMILY
 }
 
-/// As SVG.
+/// Draws a chart as SVG.
 ///
 /// # Errors
-/// What plotters reports; in memory there is nothing that should.
+/// plotters fails, which is not expected in memory.
 pub(crate) fn svg(chart: &impl Draw, theme: &Theme) -> Result<String, String> {
     let mut svg = String::new();
     let mut draw = || -> Result<(), Failed> {
@@ -330,10 +338,10 @@ pub(crate) fn svg(chart: &impl Draw, theme: &Theme) -> Result<String, String> {
     Ok(svg)
 }
 
-/// As pixels, twice the size of the SVG along each edge.
+/// Draws a chart as pixels, twice the size of the SVG along each edge.
 ///
 /// # Errors
-/// As [`svg`].
+/// plotters fails, which is not expected in memory.
 pub(crate) fn pixels(chart: &impl Draw, theme: &Theme) -> Result<Pixels, String> {
     let (w, h) = chart.size();
     let scale = PNG_SCALE * SMOOTH;
@@ -350,7 +358,7 @@ pub(crate) fn pixels(chart: &impl Draw, theme: &Theme) -> Result<Pixels, String>
     let size = [w * PNG_SCALE, h * PNG_SCALE];
     let (row, n) = (wide as usize * 3, SMOOTH as usize);
     let mut rgb = Vec::with_capacity(size[0] as usize * size[1] as usize * 3);
-    // Sums of a row of pixels, then their means: tests draw charts without optimisation, too.
+    // By sums of whole rows, to be fast enough in tests without optimisation, too.
     let mut sums = vec![0u16; size[0] as usize * 3];
     let whole = (n * n) as u16;
     for rows in bytes.chunks_exact(row * n) {
@@ -391,7 +399,7 @@ pub(crate) fn write_png(image: &Pixels, out: &mut impl std::io::Write) -> std::i
     png.finish().map_err(io_error)
 }
 
-/// Writes it as `stem`.svg and `stem`.png into a folder.
+/// Writes a chart as `stem`.svg and `stem`.png into a folder.
 pub(crate) fn save(
     chart: &impl Draw,
     theme: &Theme,
@@ -404,7 +412,7 @@ pub(crate) fn save(
     write_atomic(&dir.join(format!("{stem}.png")), |f| write_png(&pixels, f))
 }
 
-/// An axis in logarithms: its ends, and where its ticks stand.
+/// A logarithmic axis with its ticks.
 #[derive(Clone, Debug)]
 pub(crate) struct LogAxis {
     from: f64,
@@ -413,8 +421,8 @@ pub(crate) struct LogAxis {
 }
 
 impl LogAxis {
-    /// Around all values that are above zero, with ticks at 1, 2 and 5 of each power of ten (at 1
-    /// alone where that is too many).
+    /// Returns an axis over all values above zero, with ticks at 1, 2 and 5 of each power of ten (at 1
+    /// alone, if these are too many).
     pub(crate) fn over(values: impl Iterator<Item = f64>) -> LogAxis {
         let (mut lo, mut hi) = (f64::INFINITY, f64::NEG_INFINITY);
         for v in values.filter(|v| v.is_finite() && *v > 0.0) {
@@ -423,7 +431,7 @@ impl LogAxis {
         if lo > hi {
             (lo, hi) = (0.1, 10.0);
         }
-        // A picture of one point has an axis as well.
+        // Even a single value gets an axis.
         let (from, to) = (libm::log10(lo), libm::log10(hi));
         let room = (0.06 * (to - from)).max(0.08);
         let (from, to) = (from - room, to + room);
@@ -445,14 +453,14 @@ impl LogAxis {
         LogAxis { from, to, ticks }
     }
 
-    /// Where a value lies, from 0 to 1; what is not above zero lies at the lower end.
-    pub(crate) fn at(&self, value: f64) -> f64 {
-        let at = if value > 0.0 { libm::log10(value) } else { self.from };
-        ((at - self.from) / (self.to - self.from)).clamp(0.0, 1.0)
+    /// Returns the position of a value from 0 to 1; values up to zero are at the lower end.
+    pub(crate) fn position(&self, value: f64) -> f64 {
+        let log = if value > 0.0 { libm::log10(value) } else { self.from };
+        ((log - self.from) / (self.to - self.from)).clamp(0.0, 1.0)
     }
 }
 
-/// A number as a tick has it: `0.02`, `5`, `1000`, `1e-5`.
+/// Formats a number for a tick: `0.02`, `5`, `1000`, `1e-5`.
 pub(crate) fn tick(x: f64) -> String {
     if !(1e-3..1e5).contains(&x) {
         return format!("{x:.0e}");
@@ -484,7 +492,7 @@ mod tests {
     }
 
     #[test]
-    fn the_same_is_drawn_in_both_ways_and_on_both_grounds() {
+    fn charts_are_drawn_as_svg_and_png_on_both_backgrounds() {
         for theme in [&LIGHT, &DARK] {
             let svg = svg(&Sample, theme).unwrap();
             assert!(svg.contains("Hello") && svg.contains("DejaVu Sans"), "{svg}");
@@ -511,7 +519,7 @@ mod tests {
     }
 
     #[test]
-    fn labels_keep_apart() {
+    fn labels_do_not_overlap() {
         let room = Box2 { x0: 0.0, y0: 0.0, x1: 300.0, y1: 100.0 };
         let points = [(100.0, 50.0), (104.0, 52.0), (108.0, 50.0), (290.0, 50.0)];
         let mut taken: Vec<Box2> = points.iter().map(|&p| Box2::about(p, 4.0)).collect();
@@ -524,11 +532,11 @@ mod tests {
     }
 
     #[test]
-    fn axes_hold_all_and_have_round_ticks() {
+    fn log_axis_holds_all_values_and_has_round_ticks() {
         let axis = LogAxis::over([0.0, 3.0, 40.0, f64::NAN].into_iter());
         assert_eq!(axis.ticks, [5.0, 10.0, 20.0]);
-        assert!(axis.at(3.0) > 0.0 && axis.at(40.0) < 1.0 && axis.at(0.0) == 0.0);
-        assert!(axis.at(10.0) > axis.at(5.0));
+        assert!(axis.position(3.0) > 0.0 && axis.position(40.0) < 1.0 && axis.position(0.0) == 0.0);
+        assert!(axis.position(10.0) > axis.position(5.0));
         assert!(!LogAxis::over(std::iter::once(7.0)).ticks.is_empty());
         assert_eq!([0.02, 0.5, 5.0, 1000.0, 1e-5].map(tick), ["0.02", "0.5", "5", "1000", "1e-5"]);
     }

@@ -1,33 +1,33 @@
-//! Figures: errors against what they depend on, as SVG.
+//! Log-log figures of errors, as SVG.
 //!
-//! By plotters (MIT, the most used plotting library of Rust), with its SVG writer; text is set by
-//! whoever shows the file, perhaps in another font than it was measured in ([`crate::chart`]). So
-//! nothing here relies on that: ticks are few, the legend has a place of its own below the panels, and
-//! slopes are named where their lines end.
+//! Drawn by the SVG writer of plotters. The viewer may use another font than the text was measured in
+//! ([`crate::chart`]), so the layout does not depend on it: ticks are few, the legend has its own
+//! place below the panels, and slopes are named where their lines end.
 //!
-//! The ground is opaque and light, so that a figure reads the same in a light page and a dark one.
+//! The background is opaque and light, so that a figure looks the same on a light and a dark page.
 
 use crate::chart::family;
 use plotters::coord::Shift;
 use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, ValueFormatter};
 use plotters::prelude::*;
 
-/// Size of a panel and what stands around it, in pixels. Two panels are as wide as a page of
-/// text; at half, ticks touch.
+/// Size of a panel in pixels. Two panels are as wide as a page of text; at half that, ticks touch.
 const PANEL: (u32, u32) = (430, 330);
+/// Height of the title in pixels.
 const TITLE: u32 = 34;
+/// Height of the legend in pixels.
 const LEGEND: u32 = 34;
 
 const GROUND: RGBColor = RGBColor(252, 252, 248);
 const INK: RGBColor = RGBColor(40, 40, 40);
 const FAINT: RGBColor = RGBColor(222, 222, 216);
 const GUIDE: RGBColor = RGBColor(150, 150, 146);
-/// Room around what is drawn, in powers of the axis.
+/// Margin around the points, in powers of the axis.
 const MARGIN: f64 = 0.3;
 /// Height of the guides, in powers of ten.
 const FAN: f64 = 1.0;
 
-/// Okabe and Ito's colours, which most colour-blind readers tell apart; shapes do it for the rest.
+/// Colours of Okabe and Ito, which most colour-blind readers can tell apart; shapes serve the rest.
 const COLOURS: [RGBColor; 4] =
     [RGBColor(213, 94, 0), RGBColor(0, 114, 178), RGBColor(0, 140, 100), RGBColor(110, 60, 130)];
 
@@ -50,7 +50,7 @@ impl Series {
     }
 }
 
-/// One of the diagrams of a figure. All have the same series, in the same order.
+/// One diagram of a figure. All panels have the same series, in the same order.
 pub(crate) struct Panel {
     pub(crate) title: String,
     pub(crate) series: Vec<Series>,
@@ -66,7 +66,7 @@ pub(crate) struct LogLog {
     pub(crate) panels: Vec<Panel>,
 }
 
-/// An axis in logarithms with a tick at each integer.
+/// A logarithmic axis with a tick at each integer power.
 #[derive(Clone)]
 struct Powers {
     from: f64,
@@ -98,13 +98,13 @@ impl ValueFormatter<f64> for Powers {
     }
 }
 
-/// `1/8`, `1`, `2`.
-fn of_two(power: i32) -> String {
+/// Formats a power of two: `1/8`, `1`, `2`.
+fn power_of_two(power: i32) -> String {
     if power < 0 { format!("1/{}", 1u64 << -power) } else { (1u64 << power).to_string() }
 }
 
-/// `1e-3`, `0.1`, `10`.
-fn of_ten(power: i32) -> String {
+/// Formats a power of ten: `1e-3`, `0.1`, `10`.
+fn power_of_ten(power: i32) -> String {
     match power {
         -2..=3 => format!("{}", libm::pow(10.0, f64::from(power))),
         _ => format!("1e{power}"),
@@ -114,10 +114,10 @@ fn of_ten(power: i32) -> String {
 type Failed = Box<dyn std::error::Error>;
 
 impl LogLog {
-    /// The figure as SVG.
+    /// Draws the figure as SVG.
     ///
     /// # Errors
-    /// What plotters reports; in memory there is nothing that should.
+    /// plotters fails, which is not expected in memory.
     pub(crate) fn svg(&self) -> Result<String, String> {
         let mut svg = String::new();
         self.draw(&mut svg).map_err(|e| e.to_string())?;
@@ -144,8 +144,8 @@ impl LogLog {
         Ok(())
     }
 
-    /// Where the guides meet: under all that is drawn at the largest x, since errors grow to
-    /// the right and leave that corner free.
+    /// Returns the point where the guides meet: below all points at the largest x, since errors grow
+    /// to the right and leave that corner free.
     fn fan(&self, x: [f64; 2], y: [f64; 2]) -> (f64, f64) {
         let right = x[1] - MARGIN;
         let least = self
@@ -159,7 +159,7 @@ impl LogLog {
         self.panels.iter().flat_map(|p| &p.series).flat_map(|s| &s.points).copied()
     }
 
-    /// Logarithms between which everything lies.
+    /// Returns the ranges of the logarithms of x and y.
     fn ranges(&self) -> ([f64; 2], [f64; 2]) {
         let over = |values: &mut dyn Iterator<Item = f64>| {
             let r = values
@@ -189,8 +189,8 @@ impl LogLog {
             .x_label_area_size(44)
             .y_label_area_size(58)
             .build_cartesian_2d(
-                Powers { from: x[0], to: x[1], name: of_two },
-                Powers { from: y[0], to: y[1], name: of_ten },
+                Powers { from: x[0], to: x[1], name: power_of_two },
+                Powers { from: y[0], to: y[1], name: power_of_ten },
             )?;
         chart
             .configure_mesh()
@@ -244,7 +244,7 @@ impl LogLog {
     }
 }
 
-/// A sample and a name for each series, in a row.
+/// Draws a row with sample and name of each series.
 fn legend(area: &DrawingArea<SVGBackend<'_>, Shift>, series: &[Series]) -> Result<(), Failed> {
     let (width, _) = area.dim_in_pixel();
     let mut x = 24;
@@ -282,7 +282,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_figure_names_its_lines_and_survives_zeros() {
+    fn figure_names_its_lines_and_survives_zeros() {
         let points = vec![(2.0, 1.0), (1.0, 0.25), (0.5, 0.0)];
         let figure = LogLog {
             title: "wall".into(),
@@ -308,7 +308,7 @@ mod tests {
 
     #[test]
     fn ticks_are_powers() {
-        assert_eq!([-5, -1, 0, 1].map(of_two), ["1/32", "1/2", "1", "2"]);
-        assert_eq!([-3, -2, 0, 2].map(of_ten), ["1e-3", "0.01", "1", "100"]);
+        assert_eq!([-5, -1, 0, 1].map(power_of_two), ["1/32", "1/2", "1", "2"]);
+        assert_eq!([-3, -2, 0, 2].map(power_of_ten), ["1e-3", "0.01", "1", "100"]);
     }
 }

@@ -64,19 +64,19 @@ impl Draw for Chart<'_> {
         let x = LogAxis::over(self.lines().map(|l| l.ms.all.median));
         let y = LogAxis::over(self.lines().map(|l| l.error.rmse));
         let position = |l: &Line| {
-            let (tx, ty) = (x.at(l.ms.all.median), y.at(l.error.rmse));
+            let (tx, ty) = (x.position(l.ms.all.median), y.position(l.error.rmse));
             (
                 PLOT_AREA.x0 + tx * (PLOT_AREA.x1 - PLOT_AREA.x0),
                 PLOT_AREA.y1 - ty * (PLOT_AREA.y1 - PLOT_AREA.y0),
             )
         };
         for &t in &x.ticks {
-            let px = PLOT_AREA.x0 + x.at(t) * (PLOT_AREA.x1 - PLOT_AREA.x0);
+            let px = PLOT_AREA.x0 + x.position(t) * (PLOT_AREA.x1 - PLOT_AREA.x0);
             on.line(&[(px, PLOT_AREA.y0), (px, PLOT_AREA.y1)], 1.0, theme.grid)?;
             on.text(&tick(t), (px, PLOT_AREA.y1 + 18.0), 12.0, Anchor::Middle, theme.ink)?;
         }
         for &t in &y.ticks {
-            let py = PLOT_AREA.y1 - y.at(t) * (PLOT_AREA.y1 - PLOT_AREA.y0);
+            let py = PLOT_AREA.y1 - y.position(t) * (PLOT_AREA.y1 - PLOT_AREA.y0);
             on.line(&[(PLOT_AREA.x0, py), (PLOT_AREA.x1, py)], 1.0, theme.grid)?;
             on.text(&tick(t), (PLOT_AREA.x0 - 8.0, py + 4.0), 12.0, Anchor::Right, theme.ink)?;
         }

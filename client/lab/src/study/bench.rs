@@ -1,8 +1,7 @@
-//! What a study measures, and in what order: so that what is finished stands by itself when somebody
-//! stops it.
+//! Runs the measurements of a study, in an order in which the finished parts stand alone after Ctrl-C.
 
 use super::paper::{self, NODES};
-use super::simulate::{Bed, Pace};
+use super::simulate::{MeasuredPath, Pace};
 use super::{
     Effects, Machine, Study, StudyArgs, effects, live, nodes, order, runs, verdict, write,
 };
@@ -19,14 +18,14 @@ use slabcast_session::signals;
 use slabcast_sim::Link;
 use slabcast_trace::Pings;
 
-/// Frames of a setting of radius or size.
+/// Number of frames for each radius or picture size.
 const EFFECT_FRAMES: usize = 3;
-/// Views of a first look.
+/// Number of views with `--quick`.
 const QUICK_VIEWS: usize = 6;
-/// Wanted ratio of macrotiles to rendering nodes: the middle of the paper's 2 to 3 (4.3).
+/// Ratio of macrotiles to rendering nodes: the middle of the paper's 2 to 3 (4.3).
 const TILES_A_NODE: f64 = 2.5;
 
-/// The work of the slab schedule in so many slabs of one thickness, as in the paper.
+/// Returns the work of the slab schedule in `slabs` slabs of equal thickness, as in the paper.
 fn work(slabs: u32) -> Work {
     Work {
         slabs,
@@ -37,7 +36,7 @@ fn work(slabs: u32) -> Work {
     }
 }
 
-/// What a study is made with.
+/// A study in progress.
 pub(super) struct Bench<'a> {
     args: &'a StudyArgs,
     request: RenderRequest,
@@ -45,16 +44,16 @@ pub(super) struct Bench<'a> {
     link: Link,
     repeats: u32,
     views: usize,
-    /// What messages take here.
+    /// Processor time of messages here; `None` if it could not be measured.
     pings: Option<Pings>,
-    /// Rendering nodes that are run for real.
+    /// Numbers of rendering nodes that are run for real.
     live: Vec<u32>,
     progress: Progress,
     done: usize,
 }
 
 impl Bench<'_> {
-    /// Opens the volume and refuses what can't be drawn of it.
+    /// Opens the volume and refuses requests that can't be drawn.
     pub(super) fn open(args: &StudyArgs) -> Result<Bench<'_>, Fail> {
         let mut request = args.of.scene.request(work(paper::SLABS[0]))?;
         if args.quick && request.path.frames() > QUICK_VIEWS {
@@ -87,23 +86,23 @@ impl Bench<'_> {
         })
     }
 
-    fn stage(&self, request: &RenderRequest) -> Result<PathScenes, Fail> {
+    fn scenes(&self, request: &RenderRequest) -> Result<PathScenes, Fail> {
         PathScenes::new(&self.opened.volume, &self.opened.info, request, self.opened.orientation)
     }
 
-    /// Draws the tiles of some views and makes them ready to be simulated.
-    fn bed(
+    /// Draws and times the tiles of some views, for simulation.
+    fn measure_path(
         &mut self,
-        stage: &PathScenes,
+        scenes: &PathScenes,
         request: &RenderRequest,
         views: usize,
         schedules: &[Schedule],
         repeats: u32,
-    ) -> Result<Bed, Fail> {
+    ) -> Result<MeasuredPath, Fail> {
         let most = NODES.iter().map(|n| n - 1).chain(self.live.iter().copied());
         let wanted = most.chain([paper::FIGURE_1_WORKERS]);
         let path = MeasureArgs {
-            scenes: stage,
+            scenes: scenes,
             frames: views,
             work: request.work,
             wanted: wanted.map(|n| (TILES_A_NODE * f64::from(n)).ceil() as u64).collect(),
@@ -114,18 +113,18 @@ impl Bench<'_> {
             pings: self.pings,
             names: (self.opened.volume.name.clone(), request.transfer.name()),
         };
-        let jobs = measure::jobs(stage, views, request.work)?;
+        let jobs = measure::jobs(scenes, views, request.work)?;
         let trace = measure::measure(&path, (&mut self.progress, self.done))?;
         self.done += views;
-        Bed::new(jobs, trace, self.link, schedules, NODES[4] - 1)
+        MeasuredPath::new(jobs, trace, self.link, schedules, NODES[4] - 1)
     }
 
-    /// All of it, or what was finished when somebody said stop.
+    /// Runs the study; after Ctrl-C returns the finished parts.
     pub(super) fn study(mut self) -> Result<Study, Fail> {
         let threads = machine::cores() as usize;
         let mut request = self.request.clone();
         self.progress.phase("cutting the volume into bricks");
-        let stage = self.stage(&request)?;
+        let scenes = self.scenes(&request)?;
         let settings = self.settings();
         let of_effects: usize = settings.iter().map(|_| EFFECT_FRAMES.min(self.views)).sum();
         let of_live = self.live.len() * 2 * self.request.path.frames();
@@ -134,31 +133,30 @@ impl Bench<'_> {
 
         let schedules = [Schedule::Slab, Schedule::Region];
         let views = self.views;
-        let bed = self.bed(&stage, &request, views, &schedules, self.repeats)?;
-        let mut study = self.empty(&stage, &bed);
-        if bed.trace.frames.len() < 2.min(views) {
+        let measured_path =
+            self.measure_path(&scenes, &request, views, &schedules, self.repeats)?;
+        let mut study = self.empty(&scenes, &measured_path);
+        if measured_path.trace.frames.len() < 2.min(views) {
             self.progress.end();
-            return Err(Fail::failed(
-                "stopped before two views were drawn: there is nothing to say",
-            ));
+            return Err(Fail::failed("stopped before two views were drawn; nothing is written"));
         }
-        if bed.trace.frames.iter().flat_map(|f| &f.slabs).all(|s| s.levels.is_empty()) {
+        if measured_path.trace.frames.iter().flat_map(|f| &f.slabs).all(|s| s.levels.is_empty()) {
             self.progress.end();
             return Err(Fail::failed(
                 "no view shows anything: there is nothing to time; give another --tf or --crop \
                  (`slabcast info VOLUME` has the range of values)",
             ));
         }
-        let stopped = bed.trace.frames.len() < views;
-        study.views = bed.trace.frames.len();
-        study.figure_1 = order::find(&bed)?;
-        study.table_1 = nodes::table_1(&bed)?;
-        study.figure_3 = nodes::breakdowns(&bed)?;
-        study.runs = runs::simulated(&bed, Schedule::Slab, &self.live, threads)?;
-        study.runs.extend(runs::simulated(&bed, Schedule::Region, &self.live, threads)?);
-        study.effects.bricks = effects::bricks(&stage, &bed);
+        let stopped = measured_path.trace.frames.len() < views;
+        study.views = measured_path.trace.frames.len();
+        study.figure_1 = order::find(&measured_path)?;
+        study.table_1 = nodes::table_1(&measured_path)?;
+        study.figure_3 = nodes::breakdowns(&measured_path)?;
+        study.runs = runs::simulated(&measured_path, Schedule::Slab, &self.live, threads)?;
+        study.runs.extend(runs::simulated(&measured_path, Schedule::Region, &self.live, threads)?);
+        study.effects.bricks = effects::bricks(&scenes, &measured_path);
 
-        let alone = bed.alone_ms(Pace::Here);
+        let alone = measured_path.alone_ms(Pace::Here);
         if !(stopped || signals::stop_requested()) {
             let works = paper::SLABS.map(work);
             for workers in self.live.clone() {
@@ -167,8 +165,8 @@ impl Bench<'_> {
                     detail: format!("{workers} workers of this machine"),
                     ..Step::default()
                 });
-                let told = live::run(&self.opened, &self.request, workers, &works)?;
-                for (slabs, frames) in paper::SLABS.into_iter().zip(&told) {
+                let reports = live::run(&self.opened, &self.request, workers, &works)?;
+                for (slabs, frames) in paper::SLABS.into_iter().zip(&reports) {
                     study.runs.push(runs::measured(slabs, workers, alone, frames));
                 }
                 self.done += 2 * self.request.path.frames();
@@ -179,31 +177,32 @@ impl Bench<'_> {
         }
         if !(stopped || signals::stop_requested()) {
             request.work = work(paper::SLABS[1]);
-            let five = self.bed(&stage, &request, views, &[Schedule::Slab], self.repeats)?;
+            let five =
+                self.measure_path(&scenes, &request, views, &[Schedule::Slab], self.repeats)?;
             if five.trace.frames.len() == views {
                 study.runs.extend(runs::simulated(&five, Schedule::Slab, &self.live, threads)?);
             }
-            study.effects.culling = Some(effects::culling(&stage, views)?);
+            study.effects.culling = Some(effects::culling(&scenes, views)?);
         }
-        drop(stage);
-        let stretch = bed.stretch(Pace::Paper);
+        drop(scenes);
+        let stretch = measured_path.stretch(Pace::Paper);
         for (name, request) in settings {
             if stopped || signals::stop_requested() {
                 break;
             }
-            let stage = self.stage(&request)?;
+            let scenes = self.scenes(&request)?;
             let n = EFFECT_FRAMES.min(views);
-            let bed = self.bed(&stage, &request, n, &[Schedule::Slab], 1)?;
-            if bed.trace.frames.len() == n {
+            let measured_path = self.measure_path(&scenes, &request, n, &[Schedule::Slab], 1)?;
+            if measured_path.trace.frames.len() == n {
                 let is_radius = name.starts_with("radius");
-                let setting = effects::Setting::new(name, &bed, stretch)?;
+                let setting = effects::Setting::new(name, &measured_path, stretch)?;
                 let of = &mut study.effects;
                 if is_radius { of.radii.push(setting) } else { of.sizes.push(setting) }
             }
         }
         self.progress.end();
         if stopped || signals::stop_requested() {
-            progress::note("stopped: what is finished is written down");
+            progress::note("stopped: the finished parts are written");
             study.left_out.push("Stopped before the end: later parts are missing.".into());
         } else {
             study.complete = true;
@@ -213,7 +212,7 @@ impl Bench<'_> {
         Ok(study)
     }
 
-    /// Radius and size, one at a time: a name and what is asked for.
+    /// Returns name and request of each radius and picture size, varied one at a time.
     fn settings(&self) -> Vec<(String, RenderRequest)> {
         let mut all = Vec::new();
         let base = &self.request;
@@ -227,7 +226,7 @@ impl Bench<'_> {
                 }
             }
         }
-        // The paper's 512, 1024 and 2048 where nobody asks for another size.
+        // The paper's 512, 1024 and 2048 for the default size.
         let times: &[u32] = if self.args.quick { &[1, 2] } else { &[1, 2, 4] };
         for n in times {
             let [w, h] = base.path.size.map(|x| x * n);
@@ -240,8 +239,8 @@ impl Bench<'_> {
         all
     }
 
-    /// A study without figures.
-    fn empty(&self, stage: &PathScenes, bed: &Bed) -> Study {
+    /// Returns a study without results.
+    fn empty(&self, scenes: &PathScenes, measured_path: &MeasuredPath) -> Study {
         let mut left_out = vec![
             "Bricks of 4 and 16 voxels are counted, not drawn: slabcast's bricks are 8. The paper has \
              no numbers for them either."
@@ -279,10 +278,10 @@ impl Bench<'_> {
             link: self.args.link.to_string(),
             latency_us: self.args.latency as f64 / 1e3,
             repeats: self.repeats,
-            voxels: stage.bricks.iter().map(|b| b.len() as u64).sum(),
-            bytes: stage.bricks.iter().map(|b| b.encoded_len() as u64).sum(),
-            alone_ms: bed.alone_ms(Pace::Here),
-            stretch: bed.stretch(Pace::Paper),
+            voxels: scenes.bricks.iter().map(|b| b.len() as u64).sum(),
+            bytes: scenes.bricks.iter().map(|b| b.encoded_len() as u64).sum(),
+            alone_ms: measured_path.alone_ms(Pace::Here),
+            stretch: measured_path.stretch(Pace::Paper),
             complete: false,
             left_out,
             verdicts: Vec::new(),

@@ -1,4 +1,4 @@
-//! The study's charts: what is drawn of which figures, and one sentence that says what it shows.
+//! The charts of a study, each with a sentence that explains it.
 
 use super::Study;
 use super::draw::{Bars, Look, Plot, Series, Steps};
@@ -7,13 +7,13 @@ use super::runs::{Frame, Origin, Run};
 use super::simulate::Pace;
 use crate::chart::{self, Mark, Pixels, Theme};
 
-/// Either kind.
+/// A chart of lines or of bars.
 pub(super) enum Picture {
     Plot(Plot),
     Bars(Bars),
 }
 
-/// A chart with its file's name and a sentence.
+/// A chart with the stem of its file name and an explanation.
 pub(super) struct Chart {
     pub(super) stem: &'static str,
     pub(super) says: String,
@@ -21,7 +21,7 @@ pub(super) struct Chart {
 }
 
 impl Chart {
-    /// As SVG.
+    /// Draws the chart as SVG.
     pub(super) fn svg(&self, theme: &Theme) -> Result<String, String> {
         match &self.picture {
             Picture::Plot(plot) => chart::svg(plot, theme),
@@ -29,7 +29,7 @@ impl Chart {
         }
     }
 
-    /// As pixels.
+    /// Draws the chart as pixels.
     pub(super) fn pixels(&self, theme: &Theme) -> Result<Pixels, String> {
         match &self.picture {
             Picture::Plot(plot) => chart::pixels(plot, theme),
@@ -38,7 +38,7 @@ impl Chart {
     }
 }
 
-/// All that there are figures for, in the paper's order.
+/// Returns all charts that the study has results for, in the paper's order.
 pub(super) fn charts(study: &Study) -> Vec<Chart> {
     let mut all = Vec::new();
     order(study, &mut all);
@@ -149,8 +149,8 @@ fn breakdown(study: &Study, all: &mut Vec<Chart>) {
     });
 }
 
-/// Runs of one kind, by nodes.
-fn of(study: &Study, origin: Origin, pace: Pace, slabs: Option<u32>) -> Vec<&Run> {
+/// Returns the runs of one kind by number of nodes.
+fn runs_of_kind(study: &Study, origin: Origin, pace: Pace, slabs: Option<u32>) -> Vec<&Run> {
     let mut runs: Vec<&Run> = study.runs.iter().filter(|r| r.is(origin, pace, slabs)).collect();
     runs.sort_by_key(|r| r.nodes);
     runs
@@ -162,7 +162,7 @@ fn by_view(run: &Run, value: impl Fn(&Frame) -> f64) -> Vec<(f64, f64)> {
 
 fn data(study: &Study, all: &mut Vec<Chart>) {
     let run = |slabs: u32| {
-        let runs = of(study, Origin::Predicted, Pace::Paper, Some(slabs));
+        let runs = runs_of_kind(study, Origin::Predicted, Pace::Paper, Some(slabs));
         runs.into_iter().find(|r| r.nodes == NODES[1])
     };
     let a_voxel = study.bytes as f64 / study.voxels.max(1) as f64;
@@ -197,7 +197,7 @@ fn data(study: &Study, all: &mut Vec<Chart>) {
         });
     }
     for (slabs, stem, letter) in [(SLABS[0], "figure4b", "b"), (SLABS[1], "figure4c", "c")] {
-        let runs = of(study, Origin::Predicted, Pace::Paper, Some(slabs));
+        let runs = runs_of_kind(study, Origin::Predicted, Pace::Paper, Some(slabs));
         let runs = runs.into_iter().filter(|r| NODES.contains(&r.nodes)).enumerate();
         let one = |(i, r): (usize, &Run)| {
             let points = by_view(r, |f| f.broadcast_ms).into_iter().filter(|p| p.1 > 0.0);
@@ -227,7 +227,7 @@ fn data(study: &Study, all: &mut Vec<Chart>) {
 
 fn times(study: &Study, all: &mut Vec<Chart>) {
     for (slabs, stem, letter) in [(SLABS[0], "figure5a", "a"), (SLABS[1], "figure5b", "b")] {
-        let runs = of(study, Origin::Predicted, Pace::Paper, Some(slabs));
+        let runs = runs_of_kind(study, Origin::Predicted, Pace::Paper, Some(slabs));
         let runs = runs.into_iter().filter(|r| NODES.contains(&r.nodes)).enumerate();
         let one = |(i, r): (usize, &Run)| {
             line(format!("{} nodes", r.nodes), Look::Line(i), by_view(r, |f| f.ms / 1e3))
@@ -272,7 +272,7 @@ fn speed(study: &Study, all: &mut Vec<Chart>) {
     ];
     let series = |value: &dyn Fn(&Run) -> f64| -> Vec<Series> {
         let of = kinds.iter().map(|(name, origin, pace, slabs, look)| {
-            let runs = of(study, *origin, *pace, *slabs);
+            let runs = runs_of_kind(study, *origin, *pace, *slabs);
             line(*name, *look, runs.iter().map(|r| (f64::from(r.nodes), value(r))).collect())
         });
         of.filter(|s| !s.points.is_empty()).collect()

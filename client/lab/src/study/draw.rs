@@ -1,7 +1,7 @@
-//! How the study's charts are drawn: lines and points over two axes, and bars in pieces.
+//! Draws the charts of the study: lines and points over two axes, and stacked bars.
 //!
-//! Measured points are filled marks without a line, predictions are lines, the paper's numbers are
-//! diamonds in the ink of the text, so that each is told apart without its colour.
+//! Measured points are filled marks without a line, predictions are lines, the numbers of the paper
+//! are diamonds in the colour of the text, so that they differ without colour, too.
 
 use crate::chart::{Anchor, Box2, Draw, LogAxis, Mark, Sheet, Theme, tick, width};
 use plotters::prelude::DrawingBackend;
@@ -9,34 +9,36 @@ use plotters::style::RGBColor;
 
 type Failed = Box<dyn std::error::Error + Send + Sync>;
 
+/// Width and height of a chart of lines, in pixels.
 const SIZE: (u32, u32) = (900, 500);
-const ROOM: Box2 = Box2 { x0: 78.0, y0: 78.0, x1: 650.0, y1: 436.0 };
+/// The plot area between the axes, in pixels.
+const PLOT_AREA: Box2 = Box2 { x0: 78.0, y0: 78.0, x1: 650.0, y1: 436.0 };
 
-/// How an axis goes.
+/// Scale of an axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Steps {
-    /// From nothing, in even steps.
+    /// Linear, from 0.
     Even,
-    /// In powers.
+    /// Logarithmic.
     Powers,
 }
 
-/// How a series looks.
+/// Style of a series.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Look {
-    /// A line with small dots, by the number of its colour.
+    /// A line with small dots, and the index of its colour.
     Line(usize),
-    /// The same, dashed.
+    /// A dashed line with small dots, and the index of its colour.
     Dashes(usize),
-    /// Marks alone, by the number of their colour.
+    /// Marks without a line, and the index of their colour.
     Marks(Mark, usize),
-    /// What the paper says.
+    /// Numbers of the paper.
     Paper,
     /// A thin line to compare with.
     Guide,
 }
 
-/// Points of one kind.
+/// One series of a chart.
 #[derive(Clone, Debug)]
 pub(super) struct Series {
     pub(super) name: String,
@@ -51,12 +53,12 @@ pub(super) struct Plot {
     pub(super) about: String,
     pub(super) x: (String, Steps),
     pub(super) y: (String, Steps),
-    /// Where ticks stand, if they are not to be found.
+    /// Positions of the ticks; `None` to choose them.
     pub(super) x_ticks: Option<Vec<f64>>,
     pub(super) series: Vec<Series>,
 }
 
-/// Where values of an axis lie, from 0 to 1.
+/// Maps the values of an axis to positions from 0 to 1.
 enum Axis {
     Even { to: f64, ticks: Vec<f64> },
     Powers(LogAxis),
@@ -76,10 +78,10 @@ impl Axis {
         Axis::Even { to: most, ticks: ticks.map_or_else(found, <[f64]>::to_vec) }
     }
 
-    fn at(&self, value: f64) -> f64 {
+    fn position(&self, value: f64) -> f64 {
         match self {
             Axis::Even { to, .. } => (value / to).clamp(0.0, 1.0),
-            Axis::Powers(axis) => axis.at(value),
+            Axis::Powers(axis) => axis.position(value),
         }
     }
 
@@ -91,7 +93,7 @@ impl Axis {
     }
 }
 
-/// A number as an axis has it.
+/// Formats a number for an axis.
 fn number(x: f64) -> String {
     if x == 0.0 || (x.fract().abs() < 1e-9 && x.abs() < 1e5) {
         return format!("{x:.0}");
@@ -116,7 +118,7 @@ where
     on.text(&short(about, 12.0, 860.0), (22.0, 54.0), 12.0, Anchor::Left, theme.faint)
 }
 
-/// Text that fits so many pixels.
+/// Cuts a text to fit a width in pixels.
 fn short(text: &str, size: f64, wide: f64) -> String {
     if width(text, size) <= wide {
         return text.to_string();
@@ -206,21 +208,29 @@ impl Draw for Plot {
         let points = || self.series.iter().flat_map(|s| s.points.iter().copied());
         let x = Axis::new(self.x.1, points().map(|p| p.0), self.x_ticks.as_deref());
         let y = Axis::new(self.y.1, points().map(|p| p.1), None);
-        let px = |v: f64| ROOM.x0 + x.at(v) * (ROOM.x1 - ROOM.x0);
-        let py = |v: f64| ROOM.y1 - y.at(v) * (ROOM.y1 - ROOM.y0);
+        let px = |v: f64| PLOT_AREA.x0 + x.position(v) * (PLOT_AREA.x1 - PLOT_AREA.x0);
+        let py = |v: f64| PLOT_AREA.y1 - y.position(v) * (PLOT_AREA.y1 - PLOT_AREA.y0);
         for &t in x.ticks() {
-            on.line(&[(px(t), ROOM.y0), (px(t), ROOM.y1)], 1.0, theme.grid)?;
-            on.text(&number(t), (px(t), ROOM.y1 + 18.0), 12.0, Anchor::Middle, theme.ink)?;
+            on.line(&[(px(t), PLOT_AREA.y0), (px(t), PLOT_AREA.y1)], 1.0, theme.grid)?;
+            on.text(&number(t), (px(t), PLOT_AREA.y1 + 18.0), 12.0, Anchor::Middle, theme.ink)?;
         }
         for &t in y.ticks() {
-            on.line(&[(ROOM.x0, py(t)), (ROOM.x1, py(t))], 1.0, theme.grid)?;
-            on.text(&number(t), (ROOM.x0 - 8.0, py(t) + 4.0), 12.0, Anchor::Right, theme.ink)?;
+            on.line(&[(PLOT_AREA.x0, py(t)), (PLOT_AREA.x1, py(t))], 1.0, theme.grid)?;
+            on.text(&number(t), (PLOT_AREA.x0 - 8.0, py(t) + 4.0), 12.0, Anchor::Right, theme.ink)?;
         }
-        on.line(&[(ROOM.x0, ROOM.y0), (ROOM.x0, ROOM.y1), (ROOM.x1, ROOM.y1)], 1.2, theme.ink)?;
-        let middle = ((ROOM.x0 + ROOM.x1) / 2.0, (ROOM.y0 + ROOM.y1) / 2.0);
-        on.text(&self.x.0, (middle.0, ROOM.y1 + 44.0), 13.0, Anchor::Middle, theme.ink)?;
+        on.line(
+            &[
+                (PLOT_AREA.x0, PLOT_AREA.y0),
+                (PLOT_AREA.x0, PLOT_AREA.y1),
+                (PLOT_AREA.x1, PLOT_AREA.y1),
+            ],
+            1.2,
+            theme.ink,
+        )?;
+        let middle = ((PLOT_AREA.x0 + PLOT_AREA.x1) / 2.0, (PLOT_AREA.y0 + PLOT_AREA.y1) / 2.0);
+        on.text(&self.x.0, (middle.0, PLOT_AREA.y1 + 44.0), 13.0, Anchor::Middle, theme.ink)?;
         on.upwards(&self.y.0, (20.0, middle.1), 13.0, theme.ink)?;
-        let (left, mut top) = (ROOM.x1 + 22.0, ROOM.y0 + 8.0);
+        let (left, mut top) = (PLOT_AREA.x1 + 22.0, PLOT_AREA.y0 + 8.0);
         for s in &self.series {
             let at: Vec<(f64, f64)> = s.points.iter().map(|p| (px(p.0), py(p.1))).collect();
             s.look.draw(on, theme, &at)?;
@@ -238,25 +248,26 @@ impl Draw for Plot {
     }
 }
 
-/// Bars, each in pieces one after another, in groups with a name.
+/// A chart of stacked bars, in named groups.
 #[derive(Clone, Debug)]
 pub(super) struct Bars {
     pub(super) title: String,
     pub(super) about: String,
     pub(super) x: String,
-    /// What pieces are, in their order, and the number of their colour.
+    /// Name and colour index of each piece, in their order.
     pub(super) pieces: Vec<(String, usize)>,
     pub(super) groups: Vec<(String, Vec<Vec<f64>>)>,
 }
 
-/// Height of a bar with the space below it, and of a group's name.
-const BAR: f64 = 17.0;
-const NAME: f64 = 30.0;
+/// Height of a bar with the space below it, in pixels.
+const BAR_HEIGHT: f64 = 17.0;
+/// Height of the name of a group, in pixels.
+const NAME_HEIGHT: f64 = 30.0;
 
 impl Draw for Bars {
     fn size(&self) -> (u32, u32) {
         let bars: usize = self.groups.iter().map(|g| g.1.len()).sum();
-        let high = 92.0 + NAME * self.groups.len() as f64 + BAR * bars as f64 + 62.0;
+        let high = 92.0 + NAME_HEIGHT * self.groups.len() as f64 + BAR_HEIGHT * bars as f64 + 62.0;
         (SIZE.0, high as u32)
     }
 
@@ -276,7 +287,7 @@ impl Draw for Bars {
         }
         let sums = self.groups.iter().flat_map(|g| &g.1).map(|bar| bar.iter().sum::<f64>());
         let axis = Axis::new(Steps::Even, sums.collect::<Vec<_>>().into_iter(), None);
-        let px = |v: f64| left + axis.at(v) * (right - left);
+        let px = |v: f64| left + axis.position(v) * (right - left);
         for &t in axis.ticks() {
             on.line(&[(px(t), top), (px(t), bottom)], 1.0, theme.grid)?;
             on.text(&number(t), (px(t), bottom + 18.0), 12.0, Anchor::Middle, theme.ink)?;
@@ -284,9 +295,9 @@ impl Draw for Bars {
         let mut y = top;
         for (name, bars) in &self.groups {
             on.text(name, (left + 8.0, y + 20.0), 12.5, Anchor::Left, theme.ink)?;
-            y += NAME;
+            y += NAME_HEIGHT;
             for (n, bar) in bars.iter().enumerate() {
-                let row = (y + 1.5, y + BAR - 2.5);
+                let row = (y + 1.5, y + BAR_HEIGHT - 2.5);
                 on.text(
                     &(n + 1).to_string(),
                     (left - 8.0, row.1 - 2.0),
@@ -302,7 +313,7 @@ impl Draw for Bars {
                         on.bar(&own, theme.colours[colour % 8])?;
                     }
                 }
-                y += BAR;
+                y += BAR_HEIGHT;
             }
         }
         on.line(&[(left, top), (left, bottom), (right, bottom)], 1.2, theme.ink)?;

@@ -1,13 +1,13 @@
-//! Section 5.1 beyond its table: what the size of bricks, the kernel's radius and the size of the
-//! picture do, and what culling saves.
+//! Section 5.1 beyond its table: effects of the size of bricks, the radius of the kernel, the size of
+//! the picture, and culling.
 //!
-//! The paper has sentences for these and no numbers. Bricks are 8 here, and nothing else can be
-//! drawn; those of 4 and 16 are *counted*: the volume's voxels are put into boxes of that size, the
-//! boxes are projected and culled against the occlusion that was measured behind each slab.
+//! The paper states these without numbers. Only bricks of 8 voxels can be drawn here. Bricks of 4 and
+//! 16 are *counted*: the voxels are put into boxes of that size, and the boxes are projected and
+//! culled against the measured occlusion behind each slab.
 
 use super::nodes::{later, longest_wait, shares};
 use super::paper::{NODES, VOXEL_BYTES};
-use super::simulate::{Ask, Bed, Pace};
+use super::simulate::{MeasuredPath, Pace, SimulatedCluster};
 use crate::plan::clock::cpu_ns;
 use serde::Serialize;
 use slabcast_common::brick::{Brick, BrickGrid, TightBox};
@@ -22,38 +22,40 @@ use slabcast_trace::FrameTrace;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// What a size of bricks comes to, in the middle view in three slabs.
+/// Counts for one size of bricks, in the middle view with three slabs.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub(super) struct Bricks {
+    /// Edge of the bricks in voxels.
     pub(super) edge: u32,
-    /// Boxes with a relevant voxel.
+    /// Number of boxes with a relevant voxel.
     pub(super) boxes: u64,
-    /// Those that some slab needs.
+    /// Number of boxes that some slab needs.
     pub(super) needed: u64,
-    /// Voxels in them over all relevant ones.
+    /// Share of the relevant voxels that lie in needed boxes.
     pub(super) needed_voxels: f64,
-    /// Those voxels in the paper's 16 bytes, in MB.
+    /// Size of the needed voxels in MB at the paper's 16 bytes each.
     pub(super) needed_paper_mb: f64,
-    /// Voxels that macrotiles of 64 pixels have to look at, for one in a needed box: what lies over
-    /// several tiles, or in several slabs, is looked at several times.
+    /// Voxels that macrotiles of 64 pixels read, for each voxel in a needed box. A box in several tiles
+    /// or slabs is read several times.
     pub(super) looked_at: f64,
-    /// The same in macrotiles of 32 pixels.
+    /// `looked_at` for macrotiles of 32 pixels.
     pub(super) looked_at_32: f64,
 }
 
-/// The relevant voxels in boxes of `edge` (a power of two from 1): tight box and number.
+/// Sorts relevant voxels into boxes of `edge` voxels, a power of two. Returns the tight box and the
+/// number of voxels of each.
 fn boxes(bricks: &[Arc<Brick>], grid: &BrickGrid, edge: u32) -> Vec<(TightBox, u64)> {
     let mut all: BTreeMap<[u32; 3], (TightBox, u64)> = BTreeMap::new();
     for brick in bricks {
         let corner = grid.corner(brick.id);
         for &i in &brick.index {
             let i = u32::from(i);
-            let at = [corner[0] + i % 8, corner[1] + i / 8 % 8, corner[2] + i / 64];
-            let one = TightBox { lo: at, hi: at };
-            let (tight, n) = all.entry(at.map(|x| x / edge)).or_insert((one, 0));
+            let voxel = [corner[0] + i % 8, corner[1] + i / 8 % 8, corner[2] + i / 64];
+            let one = TightBox { lo: voxel, hi: voxel };
+            let (tight, n) = all.entry(voxel.map(|x| x / edge)).or_insert((one, 0));
             for a in 0..3 {
-                tight.lo[a] = tight.lo[a].min(at[a]);
-                tight.hi[a] = tight.hi[a].max(at[a]);
+                tight.lo[a] = tight.lo[a].min(voxel[a]);
+                tight.hi[a] = tight.hi[a].max(voxel[a]);
             }
             *n += 1;
         }
@@ -61,7 +63,7 @@ fn boxes(bricks: &[Arc<Brick>], grid: &BrickGrid, edge: u32) -> Vec<(TightBox, u
     all.into_values().collect()
 }
 
-/// Counts bricks of `edge` in a frame that was measured.
+/// Counts bricks of `edge` voxels in a measured frame.
 fn count(boxes: &[(TightBox, u64)], edge: u32, view: &View, frame: &FrameTrace) -> Bricks {
     let size = view.size;
     let seen: Vec<Option<Projected>> = boxes.iter().map(|b| view.project(&b.0)).collect();
@@ -105,78 +107,86 @@ fn count(boxes: &[(TightBox, u64)], edge: u32, view: &View, frame: &FrameTrace) 
     }
 }
 
-/// Bricks of 4, 8 and 16 in the middle view of a bed.
-pub(super) fn bricks(stage: &PathScenes, bed: &Bed) -> Vec<Bricks> {
-    let grid = BrickGrid::new(stage.spec(0).volume.lattice.dims);
-    let i = bed.trace.frames.len() / 2;
+/// Counts bricks of 4, 8 and 16 voxels in the middle view.
+pub(super) fn bricks(scenes: &PathScenes, measured_path: &MeasuredPath) -> Vec<Bricks> {
+    let grid = BrickGrid::new(scenes.spec(0).volume.lattice.dims);
+    let i = measured_path.trace.frames.len() / 2;
     [4, 8, 16]
         .into_iter()
         .map(|edge| {
-            let boxes = boxes(&stage.bricks, &grid, edge);
-            count(&boxes, edge, &bed.jobs[i].view, &bed.trace.frames[i])
+            let boxes = boxes(&scenes.bricks, &grid, edge);
+            count(&boxes, edge, &measured_path.jobs[i].view, &measured_path.trace.frames[i])
         })
         .collect()
 }
 
-/// A setting of radius or size: tiles of 64 pixels drawn here, 15 rendering nodes simulated at the
-/// paper's pace of the setting that was asked for.
+/// Results for one radius or picture size: tiles of 64 pixels drawn here, and 15 rendering nodes
+/// simulated at the paper's pace of the requested setting.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Setting {
-    /// `radius 1.5`, `1024x1024`.
+    /// Name such as `radius 1.5` or `1024x1024`.
     pub(super) name: String,
-    /// A frame alone on one core, in ms: drawn here.
+    /// Measured time of a frame on one core, in ms.
     pub(super) alone_ms: f64,
-    /// Sum of its macrotiles of 64 pixels, of 32 pixels: drawn here.
+    /// Measured sum of its macrotiles of 64 and of 32 pixels, in ms.
     pub(super) tiles_ms: [f64; 2],
-    /// Parts of all nodes' time: rendering, messages and bricks, waiting. Simulated.
+    /// Simulated shares of the nodes' time: rendering, messages and bricks, waiting.
     pub(super) shares: [f64; 3],
-    /// The longest wait of a node over the frame's time. Simulated.
+    /// Simulated longest wait of a node over the time of the frame.
     pub(super) max_wait: f64,
     pub(super) speed_up: f64,
 }
 
 impl Setting {
-    /// Of a bed; its tiles are stretched as those of the study's own setting.
-    pub(super) fn new(name: String, bed: &Bed, stretch: f64) -> Result<Setting, Fail> {
-        let frames = later(&bed.trace.frames);
+    /// Simulates the setting, with tile times multiplied by the study's own `stretch`.
+    pub(super) fn new(
+        name: String,
+        measured_path: &MeasuredPath,
+        stretch: f64,
+    ) -> Result<Setting, Fail> {
+        let frames = later(&measured_path.trace.frames);
         let n = frames.len().max(1) as f64;
         let tiles_ms = [64, 32].map(|edge| {
             let levels = frames.iter().flat_map(|f| &f.slabs).flat_map(|s| &s.levels);
             let tiles = levels.filter(|l| l.edge == edge).flat_map(|l| &l.tiles);
             tiles.map(|t| t.ns as f64 / 1e6).sum::<f64>() / n
         });
-        let ask = Ask { tile: Some(64), ..Ask::of(Schedule::Slab, NODES[4] - 1, Pace::Paper) };
-        let told = bed.run_at(&ask, stretch)?;
-        let told = later(&told);
-        let frame_ms: f64 = told.iter().map(|t| t.0.ms.total).sum();
-        let longest: f64 = told.iter().map(longest_wait).sum();
-        let alone_ms = bed.alone_ms(Pace::Here);
+        let cluster = SimulatedCluster {
+            tile: Some(64),
+            ..SimulatedCluster::new(Schedule::Slab, NODES[4] - 1, Pace::Paper)
+        };
+        let reports = measured_path.run_stretched(&cluster, stretch)?;
+        let reports = later(&reports);
+        let frame_ms: f64 = reports.iter().map(|t| t.0.ms.total).sum();
+        let longest: f64 = reports.iter().map(longest_wait).sum();
+        let alone_ms = measured_path.alone_ms(Pace::Here);
         Ok(Setting {
             name,
             alone_ms,
             tiles_ms,
-            shares: shares(told),
+            shares: shares(reports),
             max_wait: longest / frame_ms.max(1e-9),
-            speed_up: alone_ms * stretch * told.len() as f64 / frame_ms.max(1e-9),
+            speed_up: alone_ms * stretch * reports.len() as f64 / frame_ms.max(1e-9),
         })
     }
 }
 
-/// A frame alone on one core with culling and without, in ms; drawn here.
+/// Measured time of a frame on one core with culling and without, in ms.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(super) struct Culling {
     pub(super) with_ms: f64,
     pub(super) without_ms: f64,
 }
 
-/// Draws the middle view of `frames` both ways in turn; the shorter of two times each.
-pub(super) fn culling(stage: &PathScenes, frames: usize) -> Result<Culling, Fail> {
+/// Draws the middle view of `frames` with and without culling in turn; the shorter of two times
+/// counts.
+pub(super) fn culling(scenes: &PathScenes, frames: usize) -> Result<Culling, Fail> {
     let mut best = [f64::INFINITY; 2];
     for _ in 0..2 {
         for (best, cull) in best.iter_mut().zip([true, false]) {
-            let frame = stage.frame_with(frames / 2, |q| Quality { cull, ..q })?;
+            let frame = scenes.frame_with(frames / 2, |q| Quality { cull, ..q })?;
             let began = cpu_ns();
-            direct::draw(&frame, &stage.bricks, Cut { tile: 64, ..Cut::on(1) });
+            direct::draw(&frame, &scenes.bricks, Cut { tile: 64, ..Cut::on(1) });
             *best = best.min((cpu_ns() - began) as f64 / 1e6);
         }
     }

@@ -1,7 +1,7 @@
-//! The paper's schedule for real, as far as this machine has cores: a master and workers of one
-//! thread each inside this process.
+//! Runs the paper's schedule for real: a master and workers of one thread each inside this process, as
+//! far as this machine has cores.
 //!
-//! The master has no core of its own here: with as many workers as cores, it takes from theirs.
+//! The master has no core of its own: with as many workers as cores, it takes time from theirs.
 
 use crate::check::cluster::{embedded_frames, joined};
 use slabcast_common::image::PixelFormat;
@@ -12,7 +12,8 @@ use slabcast_session::fail::Fail;
 use slabcast_session::request::{OpenedVolume, RenderRequest};
 use slabcast_session::runtime;
 
-/// Renders the path with `workers`, once for each of `works`; the frames' statistics.
+/// Renders the path with `workers` workers, once for each of `works`. Returns the statistics of the
+/// frames.
 pub(super) fn run(
     opened: &OpenedVolume,
     request: &RenderRequest,

@@ -1,24 +1,24 @@
-//! Figure 3 and Table 1: where the time of each rendering node goes, and what smaller macrotiles do
-//! to it. From the spans that a master would write down of a simulated frame.
+//! Figure 3 and Table 1: how each rendering node spends its time, and the effect of smaller macrotiles,
+//! from the time spans of simulated frames.
 
 use super::paper::{self, NODES};
-use super::simulate::{Ask, Bed, Pace, Told};
+use super::simulate::{FrameReport, MeasuredPath, Pace, SimulatedCluster};
 use serde::Serialize;
 use slabcast_common::quality::Schedule;
 use slabcast_schedule::Span;
 use slabcast_session::fail::Fail;
 use std::collections::BTreeMap;
 
-/// What one node did in a frame, in ms: the paper's four states (5.1).
+/// Time of one node in a frame in the paper's four states (section 5.1), in ms.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub(super) struct Node {
     /// Rendering, slab by slab.
     pub(super) render: Vec<f64>,
-    /// No tile, and bricks on their way to it.
+    /// Without a tile, while bricks are in transit to the node.
     pub(super) broadcast: f64,
-    /// No tile, none on the way but leases and results, and one more to come in this slab.
+    /// Without a tile, while leases or results are in transit and a tile follows in this slab.
     pub(super) messages: f64,
-    /// No tile any more until the slab ends, or the master at work between slabs.
+    /// Without any tile until the slab ends, or while the master works between slabs.
     pub(super) wait: f64,
 }
 
@@ -28,27 +28,27 @@ impl Node {
     }
 }
 
-/// Figure 3, of one number of nodes.
+/// Data of Figure 3 for one number of nodes.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Breakdown {
     pub(super) nodes: u32,
-    /// Number of the view.
+    /// Index of the view.
     pub(super) view: usize,
     pub(super) total_ms: f64,
-    /// Edge of the macrotiles, slab by slab.
+    /// Edge of the macrotiles in pixels, slab by slab.
     pub(super) edges: Vec<u32>,
     pub(super) each: Vec<Node>,
-    /// Parts of all nodes' time, mean over all views but the first: rendering, messages and bricks,
+    /// Shares of the nodes' time over all views but the first: rendering, messages and bricks,
     /// waiting.
     pub(super) shares: [f64; 3],
 }
 
-/// Microseconds of `of` that lie in `within`, pieces of `of` being apart.
-fn overlap(of: &[(u64, u64)], within: (u64, u64)) -> u64 {
-    of.iter().map(|&(a, b)| b.min(within.1).saturating_sub(a.max(within.0))).sum()
+/// Returns the us of disjoint `intervals` that lie in `within`.
+fn overlap(intervals: &[(u64, u64)], within: (u64, u64)) -> u64 {
+    intervals.iter().map(|&(a, b)| b.min(within.1).saturating_sub(a.max(within.0))).sum()
 }
 
-/// Time joined where it overlaps.
+/// Merges overlapping intervals and sorts them.
 fn joined(mut all: Vec<(u64, u64)>) -> Vec<(u64, u64)> {
     all.sort_unstable();
     let mut out: Vec<(u64, u64)> = Vec::new();
@@ -61,8 +61,8 @@ fn joined(mut all: Vec<(u64, u64)>) -> Vec<(u64, u64)> {
     out
 }
 
-/// Each node's part of a frame, by its name.
-pub(super) fn nodes((stats, spans): &Told) -> Vec<Node> {
+/// Returns the time of each node in a frame, in the order of the workers.
+pub(super) fn nodes((stats, spans): &FrameReport) -> Vec<Node> {
     let ms = |us: u64| us as f64 / 1e3;
     let of = |category: &str| {
         let category = category.to_owned();
@@ -86,11 +86,11 @@ pub(super) fn nodes((stats, spans): &Told) -> Vec<Node> {
             let drawn = overlap(&tiles, slab);
             node.render.push(ms(drawn));
             let last = tiles.last().map_or(slab.0, |t| t.1);
-            // Between tiles; who has none in this slab waits from its beginning.
-            let (mut at, mut bricks) = (slab.0, 0);
+            // Gaps between tiles. A node without tiles in this slab waits from its beginning.
+            let (mut gap_start, mut bricks) = (slab.0, 0);
             for &(start, end) in &tiles {
-                bricks += overlap(&flights, (at, start));
-                at = end;
+                bricks += overlap(&flights, (gap_start, start));
+                gap_start = end;
             }
             let idle = (last - slab.0).saturating_sub(drawn);
             node.broadcast += ms(bricks.min(idle));
@@ -105,10 +105,10 @@ pub(super) fn nodes((stats, spans): &Told) -> Vec<Node> {
     each.collect()
 }
 
-/// The parts of all nodes' time over some frames.
-pub(super) fn shares(told: &[Told]) -> [f64; 3] {
+/// Returns the shares of the nodes' time over some frames, as in [`Breakdown::shares`].
+pub(super) fn shares(reports: &[FrameReport]) -> [f64; 3] {
     let mut sums = [0.0; 3];
-    for node in told.iter().flat_map(nodes) {
+    for node in reports.iter().flat_map(nodes) {
         sums[0] += node.render.iter().sum::<f64>();
         sums[1] += node.broadcast + node.messages;
         sums[2] += node.wait;
@@ -117,24 +117,28 @@ pub(super) fn shares(told: &[Told]) -> [f64; 3] {
     sums.map(|s| s / all.max(1e-9))
 }
 
-/// The longest that a node waits in a frame, in ms.
-pub(super) fn longest_wait(told: &Told) -> f64 {
-    nodes(told).iter().map(|n| n.wait).fold(0.0, f64::max)
+/// Returns the longest wait of a node in a frame, in ms.
+pub(super) fn longest_wait(reports: &FrameReport) -> f64 {
+    nodes(reports).iter().map(|n| n.wait).fold(0.0, f64::max)
 }
 
-/// What comes after the first frame, which also brings the bricks; the only one if there is one.
+/// Returns all frames but the first, during which the bricks are sent; a single frame as it is.
 pub(super) fn later<T>(frames: &[T]) -> &[T] {
     &frames[usize::from(frames.len() > 1)..]
 }
 
-/// Figure 3: the middle view with 16 nodes and with 5.
-pub(super) fn breakdowns(bed: &Bed) -> Result<Vec<Breakdown>, Fail> {
+/// Simulates Figure 3: the middle view with 16 nodes and with 5.
+pub(super) fn breakdowns(measured_path: &MeasuredPath) -> Result<Vec<Breakdown>, Fail> {
     [NODES[4], NODES[1]]
         .into_iter()
         .map(|nodes_all| {
-            let told = bed.run(&Ask::of(Schedule::Slab, nodes_all - 1, Pace::Paper))?;
-            let view = told.len() / 2;
-            let (stats, _) = &told[view];
+            let reports = measured_path.run(&SimulatedCluster::new(
+                Schedule::Slab,
+                nodes_all - 1,
+                Pace::Paper,
+            ))?;
+            let view = reports.len() / 2;
+            let (stats, _) = &reports[view];
             let edge =
                 |s: &slabcast_common::stats::SlabStats| s.tiles.first().map_or(0, |t| t.size);
             Ok(Breakdown {
@@ -142,8 +146,8 @@ pub(super) fn breakdowns(bed: &Bed) -> Result<Vec<Breakdown>, Fail> {
                 view,
                 total_ms: stats.ms.total,
                 edges: stats.slabs.iter().map(edge).collect(),
-                each: nodes(&told[view]),
-                shares: shares(later(&told)),
+                each: nodes(&reports[view]),
+                shares: shares(later(&reports)),
             })
         })
         .collect()
@@ -153,38 +157,44 @@ pub(super) fn breakdowns(bed: &Bed) -> Result<Vec<Breakdown>, Fail> {
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Tiles {
     pub(super) edge: &'static str,
-    /// Sum of all tiles as they were drawn here, in ms.
+    /// Sum of all tile times measured here, in ms.
     pub(super) drawn_here_ms: f64,
-    /// Sum of rendering over the nodes, at the paper's pace, in seconds.
+    /// Sum of rendering over the nodes at the paper's pace, in s.
     pub(super) summed_s: f64,
-    /// The longest that a node waits.
+    /// Longest wait of a node, in s.
     pub(super) max_wait_s: f64,
-    /// Sum over nodes, and the longest wait: what the paper's third line comes to.
+    /// `summed_s` over the number of nodes plus `max_wait_s`, in s: the paper's third line.
     pub(super) a_node_s: f64,
-    /// A frame.
+    /// Time of a frame, in s.
     pub(super) frame_s: f64,
     pub(super) tiles: f64,
 }
 
-/// Table 1: 15 rendering nodes, three slabs, tiles of 64 pixels, of 64 and then 32, of 32.
-pub(super) fn table_1(bed: &Bed) -> Result<Vec<Tiles>, Fail> {
+/// Simulates Table 1: 15 rendering nodes, three slabs, tiles of 64 pixels, of 64 and then 32, of 32.
+pub(super) fn table_1(measured_path: &MeasuredPath) -> Result<Vec<Tiles>, Fail> {
     let workers = NODES[4] - 1;
     let cuts = [(Some(64), false), (Some(64), true), (Some(32), false)];
     let columns = paper::TABLE_1.iter().zip(cuts);
     columns
-        .map(|(of, (tile, mixed))| {
-            let ask = Ask { tile, mixed, ..Ask::of(Schedule::Slab, workers, Pace::Paper) };
-            let told = bed.run(&ask)?;
-            let told = later(&told);
-            let n = told.len().max(1) as f64;
-            let mean = |of: &dyn Fn(&Told) -> f64| told.iter().map(of).sum::<f64>() / n;
-            let summed =
-                |t: &Told| nodes(t).iter().map(|n| n.render.iter().sum::<f64>()).sum::<f64>() / 1e3;
+        .map(|(column, (tile, mixed))| {
+            let cluster = SimulatedCluster {
+                tile,
+                mixed,
+                ..SimulatedCluster::new(Schedule::Slab, workers, Pace::Paper)
+            };
+            let reports = measured_path.run(&cluster)?;
+            let reports = later(&reports);
+            let n = reports.len().max(1) as f64;
+            let mean =
+                |value: &dyn Fn(&FrameReport) -> f64| reports.iter().map(value).sum::<f64>() / n;
+            let summed = |t: &FrameReport| {
+                nodes(t).iter().map(|n| n.render.iter().sum::<f64>()).sum::<f64>() / 1e3
+            };
             let summed_s = mean(&summed);
             let max_wait_s = mean(&|t| longest_wait(t) / 1e3);
             Ok(Tiles {
-                edge: of.edge,
-                drawn_here_ms: summed_s * 1e3 / bed.stretch(Pace::Paper),
+                edge: column.edge,
+                drawn_here_ms: summed_s * 1e3 / measured_path.stretch(Pace::Paper),
                 summed_s,
                 max_wait_s,
                 a_node_s: summed_s / f64::from(workers) + max_wait_s,
@@ -200,7 +210,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn time_is_shared_out_between_the_four_states() {
+    fn overlap_and_joined_of_time_intervals() {
         assert_eq!(overlap(&[(0, 4), (6, 9)], (3, 8)), 3);
         assert_eq!(joined(vec![(5, 9), (0, 2), (1, 3)]), [(0, 3), (5, 9)]);
         assert_eq!(later(&[1, 2, 3]), [2, 3]);

@@ -1,7 +1,7 @@
-//! A study as one page that needs nothing beside it: no network, no script, no font.
+//! A study as one self-contained page: no network, no script, no font.
 //!
-//! `maud` writes it and escapes every text, names of files too. Charts are put in as SVG, once for a
-//! light and once for a dark ground; the reader's system chooses.
+//! `maud` writes it and escapes every text, file names too. Charts are embedded as SVG, once for a
+//! light and once for a dark background; the system of the reader chooses.
 
 use super::Study;
 use super::charts::Chart;
@@ -43,7 +43,7 @@ figcaption { max-width: 46rem; color: var(--faint); font-size: .95rem; margin-to
 dt { font-weight: 600; } dd { margin: 0 0 .5rem; }
 ";
 
-/// The whole page. Charts come with their SVG for a light and for a dark ground.
+/// Returns the whole page. Each chart has its SVG for a light and for a dark background.
 pub(super) fn page(study: &Study, charts: &[(Chart, [String; 2])]) -> String {
     let [w, h] = study.size;
     let figure = |stem: &str| {

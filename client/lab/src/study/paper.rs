@@ -1,32 +1,31 @@
-//! What the paper says: its numbers and its words, each with the section that has them.
+//! The numbers of the paper, each with its section.
 //!
-//! Curves without numbers in the text are not read off pictures: such a figure has only the numbers
-//! that text, tables and captions state.
+//! Only numbers in text, tables and captions are used; none is read off a curve.
 
 use serde::Serialize;
 
-/// Nodes of its runs (5); one is the master.
+/// Numbers of nodes of the paper's runs (5); one node is the master.
 pub(super) const NODES: [u32; 5] = [3, 5, 9, 13, 16];
 
-/// Slabs of its two setups (5.2, 5.3).
+/// Numbers of slabs of the paper's two setups (5.2, 5.3).
 pub(super) const SLABS: [u32; 2] = [3, 5];
 
-/// Rendering nodes behind Figure 1 (4.3).
+/// Number of rendering nodes of Figure 1 (4.3).
 pub(super) const FIGURE_1_WORKERS: u32 = 9;
 
-/// Bytes of a voxel in its bricks (4.2).
+/// Bytes of a voxel in a brick of the paper (4.2).
 pub(super) const VOXEL_BYTES: u64 = 16;
 
 /// Seconds of a frame of the head on one Pentium II of 300 MHz, with occlusion culling (1).
 pub(super) const ALONE_S: f64 = 17.0;
 
-/// The same without culling (1).
+/// Seconds of a frame of the head on one Pentium II of 300 MHz, without culling (1).
 pub(super) const ALONE_UNCULLED_S: f64 = 145.0;
 
 /// Seconds of a frame of the head on all 16 nodes (1).
 pub(super) const NODES_16_S: f64 = 1.5;
 
-/// Its link: Myrinet of 1.2 Gbit/s, full duplex (5).
+/// Link of each node: Myrinet of 1.2 Gbit/s, full duplex (5).
 pub(super) const LINK: &str = "1200mbit";
 
 /// A column of Table 1, in seconds: 15 rendering nodes, 3 slabs, the head.

@@ -1,4 +1,4 @@
-//! The tables of a study's page, each with the paper's lines among its own.
+//! The tables of a study's page, each with the numbers of the paper.
 
 use super::Study;
 use super::paper::{self, NODES};
@@ -17,7 +17,7 @@ fn word(holds: Holds) -> Markup {
     html! { span class=(class) { (holds.word()) } }
 }
 
-/// What became of the paper's sentences.
+/// Returns the verdicts on the paper's sentences.
 pub(super) fn sentences(study: &Study) -> Markup {
     html! {
         div.wide {
@@ -37,7 +37,7 @@ pub(super) fn sentences(study: &Study) -> Markup {
     }
 }
 
-/// Table 1.
+/// Returns Table 1.
 pub(super) fn table_1(study: &Study) -> Markup {
     html! {
         div.wide {
@@ -72,7 +72,7 @@ pub(super) fn table_1(study: &Study) -> Markup {
     }
 }
 
-/// What Figure 1 comes to.
+/// Returns the numbers of Figure 1.
 pub(super) fn order(study: &Study) -> Markup {
     html! {
         @if let Some(o) = &study.figure_1 {
@@ -88,7 +88,7 @@ pub(super) fn order(study: &Study) -> Markup {
     }
 }
 
-/// What Figure 3 comes to.
+/// Returns the numbers of Figure 3.
 pub(super) fn shares(study: &Study) -> Markup {
     html! {
         div.wide {
@@ -110,7 +110,7 @@ pub(super) fn shares(study: &Study) -> Markup {
     }
 }
 
-/// What Figure 4 comes to.
+/// Returns the numbers of Figure 4.
 pub(super) fn data(study: &Study) -> Markup {
     html! {
         div.wide {
@@ -142,7 +142,7 @@ pub(super) fn data(study: &Study) -> Markup {
     }
 }
 
-/// What Figure 7 comes to, and real runs.
+/// Returns the numbers of Figure 7, and the real runs.
 pub(super) fn speed(study: &Study) -> Markup {
     let kinds = [
         ("3 slabs", Some(3), Pace::Paper),
@@ -219,7 +219,7 @@ fn live(study: &Study) -> Markup {
     }
 }
 
-/// Section 5.1: bricks, kernels, pictures, culling.
+/// Returns the effects of section 5.1: bricks, kernels, picture sizes, culling.
 pub(super) fn effects(study: &Study) -> Markup {
     let e = &study.effects;
     html! {
@@ -282,7 +282,7 @@ pub(super) fn effects(study: &Study) -> Markup {
     }
 }
 
-/// Milliseconds.
+/// Formats a time in ms.
 pub(super) fn ms(x: f64) -> String {
     if x < 10.0 { format!("{x:.2}") } else { format!("{x:.1}") }
 }

@@ -1,9 +1,9 @@
-//! Figures 4, 5 and 7: frames on more and more nodes, real as far as there are cores, simulated
-//! beyond; their times, and what was sent.
+//! Figures 4, 5 and 7: times and bytes of frames by number of nodes, measured as far as this machine
+//! has cores and simulated beyond.
 
 use super::nodes::later;
 use super::paper::{self, NODES, SLABS};
-use super::simulate::{Ask, Bed, Pace};
+use super::simulate::{MeasuredPath, Pace, SimulatedCluster};
 use serde::Serialize;
 use slabcast_common::quality::Schedule;
 use slabcast_common::stats::FrameStats;
@@ -13,9 +13,9 @@ use slabcast_session::fail::Fail;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Origin {
-    /// Run here, on cores.
+    /// Run on cores of this machine.
     Measured,
-    /// By the scheduler against virtual nodes.
+    /// Simulated by the scheduler on virtual nodes.
     Predicted,
 }
 
@@ -23,18 +23,18 @@ pub(super) enum Origin {
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(super) struct Frame {
     pub(super) ms: f64,
-    /// Time during which bricks were on their way to some node.
+    /// Time during which bricks were in transit to some node, in ms.
     pub(super) broadcast_ms: f64,
-    /// Voxels of the bricks that the frame needs.
+    /// Number of voxels of the bricks that the frame needs.
     pub(super) needed: u64,
-    /// Bytes of bricks that one node was sent, the most of any.
+    /// Most bytes of bricks sent to one node.
     pub(super) sent: u64,
-    /// Bytes of bricks that all nodes were sent.
+    /// Bytes of bricks sent to all nodes.
     pub(super) sent_to_all: u64,
 }
 
 impl Frame {
-    fn of(stats: &FrameStats) -> Frame {
+    fn from_stats(stats: &FrameStats) -> Frame {
         let sent = stats.workers.iter().map(|w| w.bytes_sent);
         Frame {
             ms: stats.ms.total,
@@ -52,15 +52,15 @@ pub(super) struct Run {
     pub(super) origin: Origin,
     pub(super) pace: Pace,
     pub(super) schedule: &'static str,
-    /// Of the slab schedule.
+    /// Number of slabs; `None` for the region schedule.
     pub(super) slabs: Option<u32>,
-    /// The master among them.
+    /// Number of nodes, the master included.
     pub(super) nodes: u32,
     /// Mean of the frames but the first, in ms.
     pub(super) frame_ms: f64,
-    /// One node's time for a frame over that; what the paper calls speed-up.
+    /// Time of a frame on one node over `frame_ms`, as in the paper.
     pub(super) speed_up: f64,
-    /// Speed-up over the number of nodes.
+    /// Speed-up divided by the number of nodes.
     pub(super) ratio: f64,
     pub(super) frames: Vec<Frame>,
 }
@@ -90,12 +90,12 @@ impl Run {
         }
     }
 
-    /// Whether it is one of these.
+    /// Returns whether the run has this origin, pace and number of slabs.
     pub(super) fn is(&self, origin: Origin, pace: Pace, slabs: Option<u32>) -> bool {
         (self.origin, self.pace, self.slabs) == (origin, pace, slabs)
     }
 
-    /// What it is, without its nodes.
+    /// Returns the division of work: `3 slabs` or `regions`.
     pub(super) fn kind(&self) -> String {
         match self.slabs {
             Some(n) => format!("{n} slabs"),
@@ -104,60 +104,68 @@ impl Run {
     }
 }
 
-/// Simulated runs on a bed, on the paper's numbers of nodes and those that were run for real.
+/// Simulates runs with the paper's numbers of nodes and those that are run for real.
 pub(super) fn simulated(
-    bed: &Bed,
+    measured_path: &MeasuredPath,
     schedule: Schedule,
     live: &[u32],
     threads: usize,
 ) -> Result<Vec<Run>, Fail> {
-    let slabs = bed.trace.about.slabs;
+    let slabs = measured_path.trace.about.slabs;
     let mut workers: Vec<u32> = NODES.iter().map(|n| n - 1).chain(live.iter().copied()).collect();
     workers.sort_unstable();
     workers.dedup();
     let paces = [Pace::Here, Pace::Paper];
-    let asks: Vec<Ask> = paces
+    let clusters: Vec<SimulatedCluster> = paces
         .iter()
-        .flat_map(|&pace| workers.iter().map(move |&w| Ask::of(schedule, w, pace)))
+        .flat_map(|&pace| workers.iter().map(move |&w| SimulatedCluster::new(schedule, w, pace)))
         .collect();
-    let told = bed.run_all(&asks, threads)?;
-    let run = |(ask, told): (&Ask, Vec<super::simulate::Told>)| {
-        let frames = told.iter().map(|t| Frame::of(&t.0)).collect();
-        let origin = (Origin::Predicted, ask.pace);
-        Run::new(origin, (schedule, slabs), ask.workers, bed.alone_ms(ask.pace), frames)
+    let reports = measured_path.run_all(&clusters, threads)?;
+    let run = |(cluster, reports): (&SimulatedCluster, Vec<super::simulate::FrameReport>)| {
+        let frames = reports.iter().map(|t| Frame::from_stats(&t.0)).collect();
+        let origin = (Origin::Predicted, cluster.pace);
+        Run::new(
+            origin,
+            (schedule, slabs),
+            cluster.workers,
+            measured_path.alone_ms(cluster.pace),
+            frames,
+        )
     };
-    Ok(asks.iter().zip(told).map(run).collect())
+    Ok(clusters.iter().zip(reports).map(run).collect())
 }
 
-/// A real run.
+/// Returns a real run from the statistics of its frames.
 pub(super) fn measured(slabs: u32, workers: u32, alone_ms: f64, frames: &[FrameStats]) -> Run {
-    let frames = frames.iter().map(Frame::of).collect();
+    let frames = frames.iter().map(Frame::from_stats).collect();
     Run::new((Origin::Measured, Pace::Here), (Schedule::Slab, slabs), workers, alone_ms, frames)
 }
 
-/// Figure 4 in numbers, of one number of slabs. Means are over the frames but the first.
+/// Data of Figure 4 for one number of slabs. Means are over the frames but the first.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Data {
     pub(super) slabs: u32,
-    /// Needed voxels over all relevant ones, least and most of a frame.
+    /// Least and largest share of the relevant voxels that a frame needs.
     pub(super) needed: [f64; 2],
-    /// The same in MB as the paper stores them, 16 bytes a voxel.
+    /// Size of the needed voxels in MB at the paper's 16 bytes each, least and largest.
     pub(super) needed_paper_mb: [f64; 2],
-    /// Sent to a node, in KB as slabcast encodes them: the first frame, and later ones.
+    /// Bricks sent to a node for the first frame, in KB.
     pub(super) first_kb: f64,
+    /// Bricks sent to a node for a later frame, in KB.
     pub(super) later_kb: f64,
-    /// Of later frames: over all bricks' bytes, and that over the needed part.
+    /// Bytes sent for a later frame over the bytes of all bricks.
     pub(super) later_of_all: f64,
+    /// `later_of_all` over the needed share.
     pub(super) later_of_needed: f64,
-    /// Milliseconds during which bricks are on their way in later frames, by number of nodes.
+    /// Number of nodes, and ms during which bricks are in transit in later frames.
     pub(super) broadcast_ms: Vec<(u32, f64)>,
 }
 
-/// Figure 4's numbers, at the paper's pace. `relevant` voxels take `bytes` when all are sent.
+/// Returns Figure 4 at the paper's pace. All `relevant` voxels have `bytes` bytes when sent.
 pub(super) fn data(runs: &[Run], relevant: u64, bytes: u64) -> Vec<Data> {
     let of = |slabs: u32| {
         let here = |r: &&Run| r.is(Origin::Predicted, Pace::Paper, Some(slabs));
-        // What is needed and sent to each is the same whatever their number.
+        // Needed and sent data do not depend on the number of nodes.
         let run = runs.iter().filter(here).find(|r| r.nodes == NODES[1])?;
         let share = |f: &Frame| f.needed as f64 / relevant.max(1) as f64;
         let least = run.frames.iter().map(share).fold(f64::INFINITY, f64::min);

@@ -1,18 +1,18 @@
-//! A study's tables as CSV: one for each table and figure, a line a figure, with where it comes from.
+//! The tables of a study as CSV, one for each table and figure of the paper. Each line names its origin.
 
 use super::Study;
 use super::paper;
 use super::runs::Origin;
 use super::simulate::Pace;
 
-/// A table of texts.
+/// A table of text cells.
 pub(super) struct Table {
     head: Vec<&'static str>,
     rows: Vec<Vec<String>>,
 }
 
 impl Table {
-    /// Its lines; what has commas or quotes is quoted.
+    /// Returns the table as CSV; cells with commas or quotes are quoted.
     pub(super) fn csv(&self) -> String {
         let cell = |text: &str| {
             let plain = !text.contains([',', '"', '\n', '\r']);
@@ -25,6 +25,7 @@ impl Table {
     }
 }
 
+/// Formats a number with at most four decimals.
 fn f(x: f64) -> String {
     let text = format!("{x:.4}");
     text.trim_end_matches('0').trim_end_matches('.').to_string()
@@ -38,7 +39,7 @@ fn origin(origin: Origin) -> String {
     crate::autotune::setting::lower(&origin)
 }
 
-/// Every table, by the name of its file.
+/// Returns all tables with the stems of their file names.
 pub(super) fn tables(study: &Study) -> Vec<(&'static str, Table)> {
     vec![
         ("table1", table_1(study)),

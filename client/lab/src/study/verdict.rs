@@ -1,9 +1,9 @@
-//! What the paper says, what came out here, and whether that holds.
+//! Judges whether sentences of the paper hold in the study.
 //!
-//! Each sentence has a rule, the same for every volume, with room for another decade and a scheduler
-//! that sends to each node what it lacks. A sentence about numbers of the head holds for another
+//! Each sentence has a rule, the same for every volume, with a margin for other hardware and for a
+//! scheduler that sends each node only the bricks it lacks. A sentence about numbers of the head holds for another
 //! volume only by chance; it is judged all the same, and the page says which volume it was. Where a
-//! sentence says only that something is more, 3 % are no difference: tiles that are timed twice
+//! sentence says only that something is more, 3 % count as no difference: two times of one tile
 //! differ by as much.
 
 use super::Study;
@@ -20,12 +20,12 @@ pub(super) enum Holds {
     Yes,
     Partly,
     No,
-    /// A sentence about one kind of volume: whoever reads knows whether this is one.
+    /// A sentence about one kind of volume; the reader knows whether this is one.
     Unjudged,
 }
 
 impl Holds {
-    /// As a word.
+    /// Returns the verdict in words.
     pub(super) fn word(self) -> &'static str {
         match self {
             Holds::Yes => "holds",
@@ -35,8 +35,8 @@ impl Holds {
         }
     }
 
-    /// By two conditions: the sentence, and half of it.
-    fn by(all: bool, half: bool) -> Holds {
+    /// Returns the verdict by two conditions: the sentence, and half of it.
+    fn from_conditions(all: bool, half: bool) -> Holds {
         match (all, half) {
             (true, _) => Holds::Yes,
             (false, true) => Holds::Partly,
@@ -45,34 +45,36 @@ impl Holds {
     }
 }
 
-/// One sentence.
+/// One sentence of the paper and its verdict.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Verdict {
-    /// Section, table or figure.
+    /// Section, table or figure of the paper.
     pub(super) place: &'static str,
-    /// In the paper's words or numbers.
+    /// Statement in the paper's words or numbers.
     pub(super) paper: String,
+    /// Result of this study.
     pub(super) here: String,
-    /// What was asked of the figures for `holds`.
+    /// Condition under which the sentence holds.
     pub(super) rule: &'static str,
     pub(super) holds: Holds,
 }
 
+/// Formats a share from 0 to 1 as per cent.
 pub(super) fn percent(x: f64) -> String {
     if x < 0.0995 { format!("{:.1} %", x * 100.0) } else { format!("{:.0} %", x * 100.0) }
 }
 
-/// Between these, or by half as much again outside.
+/// Returns whether `x` lies in a range; partly, up to a factor of 1.5 outside.
 fn within(x: f64, [lo, hi]: [f64; 2]) -> Holds {
-    Holds::by((lo..=hi).contains(&x), (lo / 1.5..=hi * 1.5).contains(&x))
+    Holds::from_conditions((lo..=hi).contains(&x), (lo / 1.5..=hi * 1.5).contains(&x))
 }
 
-/// Whether this is more than that.
+/// Returns whether `this` exceeds `that` by 3 %; partly, if it is within 3 %.
 fn more(this: f64, that: f64) -> Holds {
-    Holds::by(this > 1.03 * that, this > that / 1.03)
+    Holds::from_conditions(this > 1.03 * that, this > that / 1.03)
 }
 
-/// All sentences that there are figures for.
+/// Judges all sentences that the study has results for.
 pub(super) fn verdicts(study: &Study) -> Vec<Verdict> {
     let mut all = Vec::new();
     order(study, &mut all);
@@ -99,7 +101,7 @@ fn order(study: &Study, all: &mut Vec<Verdict>) {
             o.tiles.len()
         ),
         rule: "correlation of at least 0.8; partly from 0.5",
-        holds: Holds::by(o.ended >= 0.8, o.ended >= 0.5),
+        holds: Holds::from_conditions(o.ended >= 0.8, o.ended >= 0.5),
     });
     all.push(Verdict {
         place: "4.3, Figure 1b",
@@ -117,7 +119,7 @@ fn order(study: &Study, all: &mut Vec<Verdict>) {
             o.learned_all_views
         ),
         rule: "correlation over the others of at least 0.8; partly from 0.5",
-        holds: Holds::by(o.estimate_open >= 0.8, o.estimate_open >= 0.5),
+        holds: Holds::from_conditions(o.estimate_open >= 0.8, o.estimate_open >= 0.5),
     });
 }
 
@@ -130,7 +132,7 @@ fn nodes(study: &Study, all: &mut Vec<Verdict>) {
         paper: "communication is about 5 % of the time, with 16 nodes and with 5".into(),
         here: format!("{} with 16, {} with 5", percent(many.shares[1]), percent(few.shares[1])),
         rule: "at most 7.5 % with both; partly to 15 %",
-        holds: Holds::by(most <= 0.075, most <= 0.15),
+        holds: Holds::from_conditions(most <= 0.075, most <= 0.15),
     });
     all.push(Verdict {
         place: "5.1, Figure 3",
@@ -144,7 +146,7 @@ fn nodes(study: &Study, all: &mut Vec<Verdict>) {
         paper: "with 5 nodes, rendering takes more than 90 %".into(),
         here: percent(few.shares[0]),
         rule: "at least 90 %; partly from 80 %",
-        holds: Holds::by(few.shares[0] >= 0.9, few.shares[0] >= 0.8),
+        holds: Holds::from_conditions(few.shares[0] >= 0.9, few.shares[0] >= 0.8),
     });
 }
 
@@ -162,7 +164,7 @@ fn tiles(study: &Study, all: &mut Vec<Verdict>) {
         ),
         here: format!("{:.2} to {:.2} s (x {more:.2})", large.summed_s, small.summed_s),
         rule: "1.4 to 2.2 times; partly from 1.2",
-        holds: Holds::by((1.4..=2.2).contains(&more), more >= 1.2),
+        holds: Holds::from_conditions((1.4..=2.2).contains(&more), more >= 1.2),
     });
     let less = small.max_wait_s / large.max_wait_s.max(1e-9);
     all.push(Verdict {
@@ -175,7 +177,7 @@ fn tiles(study: &Study, all: &mut Vec<Verdict>) {
         ),
         here: format!("{:.2} to {:.2} s (x {less:.2})", large.max_wait_s, small.max_wait_s),
         rule: "0.7 times at most; partly to 0.9",
-        holds: Holds::by(less <= 0.7, less <= 0.9),
+        holds: Holds::from_conditions(less <= 0.7, less <= 0.9),
     });
     let worse = [large.frame_s, mixed.frame_s, small.frame_s];
     all.push(Verdict {
@@ -187,7 +189,7 @@ fn tiles(study: &Study, all: &mut Vec<Verdict>) {
         ),
         here: format!("frames of {:.2}, {:.2} and {:.2} s", worse[0], worse[1], worse[2]),
         rule: "frames of 64 pixels are the fastest, of 32 the slowest; partly: the fastest",
-        holds: Holds::by(
+        holds: Holds::from_conditions(
             worse[0] <= worse[1] && worse[1] <= worse[2],
             worse[0] <= worse[1] && worse[0] <= worse[2],
         ),
@@ -209,7 +211,7 @@ fn data(study: &Study, all: &mut Vec<Verdict>) {
             three.needed_paper_mb[1]
         ),
         rule: "most at most 27 %; partly to 50 %",
-        holds: Holds::by(most <= 0.27, most <= 0.5),
+        holds: Holds::from_conditions(most <= 0.27, most <= 0.5),
     });
     all.push(Verdict {
         place: "5.2, Figure 4a",
@@ -221,7 +223,7 @@ fn data(study: &Study, all: &mut Vec<Verdict>) {
             percent(three.later_of_all)
         ),
         rule: "at most 9 % and 1.5 %; partly: one of the two",
-        holds: Holds::by(
+        holds: Holds::from_conditions(
             three.later_of_needed <= 0.09 && three.later_of_all <= 0.015,
             three.later_of_needed <= 0.09 || three.later_of_all <= 0.015,
         ),
@@ -240,7 +242,7 @@ fn data(study: &Study, all: &mut Vec<Verdict>) {
                 "from {lo:.2} to {hi:.2} ms over 3 to 16 nodes: each is sent a stream of its own"
             ),
             rule: "at most twice from 3 to 16 nodes; partly to three times",
-            holds: Holds::by(hi <= 2.0 * lo, hi <= 3.0 * lo),
+            holds: Holds::from_conditions(hi <= 2.0 * lo, hi <= 3.0 * lo),
         });
     }
     let Some(five) = of(5) else { return };
@@ -277,7 +279,7 @@ fn speed(study: &Study, all: &mut Vec<Verdict>) {
             ),
             here: format!("{:.2} times", r.speed_up),
             rule: "at least as much; partly from three quarters",
-            holds: Holds::by(r.speed_up >= factor, r.speed_up >= 0.75 * factor),
+            holds: Holds::from_conditions(r.speed_up >= factor, r.speed_up >= 0.75 * factor),
         });
     }
     if let Some(r) = run(3, NODES[4]) {
@@ -291,7 +293,7 @@ fn speed(study: &Study, all: &mut Vec<Verdict>) {
             ),
             here: format!("{frame_s:.2} s, where one takes {:.0} s", paper::ALONE_S),
             rule: "at most 1.65 s; partly to 2.25 s",
-            holds: Holds::by(frame_s <= 1.65, frame_s <= 2.25),
+            holds: Holds::from_conditions(frame_s <= 1.65, frame_s <= 2.25),
         });
         let [(_, head), (_, skull)] = paper::RATIOS_16;
         all.push(Verdict {
@@ -303,7 +305,7 @@ fn speed(study: &Study, all: &mut Vec<Verdict>) {
             ),
             here: format!("{} ({:.1} times)", percent(r.ratio), r.speed_up),
             rule: "at least 60 %; partly from 45 %",
-            holds: Holds::by(r.ratio >= 0.6, r.ratio >= 0.45),
+            holds: Holds::from_conditions(r.ratio >= 0.6, r.ratio >= 0.45),
         });
     }
     if let (Some(ten), Some(most)) = (run(3, NODES[2]), run(3, NODES[4])) {
@@ -354,7 +356,7 @@ fn effects(study: &Study, all: &mut Vec<Verdict>) {
             ),
             here: format!("{:.1} to {:.1} ms (x {factor:.1})", c.without_ms, c.with_ms),
             rule: "5 times or more; partly from 2",
-            holds: Holds::by(factor >= 5.0, factor >= 2.0),
+            holds: Holds::from_conditions(factor >= 5.0, factor >= 2.0),
         });
     }
     if let [small, .., large] = &e.radii[..] {

@@ -1,4 +1,4 @@
-//! A study as files and as text.
+//! Writes a study as files and as text.
 
 use super::charts::{Chart, charts};
 use super::paper;
@@ -18,7 +18,7 @@ use std::path::Path;
 const PAGE: &str = "index.html";
 const JSON: &str = "study.json";
 
-/// Refuses, before anything is measured, to write over a study.
+/// Refuses to overwrite an earlier study without `--force`, before anything is measured.
 pub(super) fn check(args: &StudyArgs) -> Result<(), Fail> {
     let out = &args.out;
     match [PAGE, JSON].into_iter().find(|f| out.join(f).exists()) {
@@ -30,7 +30,7 @@ pub(super) fn check(args: &StudyArgs) -> Result<(), Fail> {
     }
 }
 
-/// The command line as it was typed, fit for a shell.
+/// Returns the command line as it was typed, quoted for a shell.
 pub(super) fn command() -> String {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_=./:,%+@".contains(c);
     let word = |w: std::ffi::OsString| {
@@ -45,7 +45,7 @@ pub(super) fn command() -> String {
     std::iter::once("slabcast".to_string()).chain(words).collect::<Vec<_>>().join(" ")
 }
 
-/// Writes all files; the page comes last.
+/// Writes all files, the page last.
 pub(super) fn files(out: &Path, study: &Study) -> Result<(), Fail> {
     let text =
         |name: &str, text: &str| write_atomic(&out.join(name), |f| f.write_all(text.as_bytes()));
@@ -72,12 +72,12 @@ pub(super) fn files(out: &Path, study: &Study) -> Result<(), Fail> {
     text(PAGE, &page::page(study, &all))
 }
 
-/// All of it.
+/// Returns the study as JSON.
 pub(super) fn json(study: &Study) -> String {
     serde_json::to_string_pretty(study).unwrap_or_default() + "\n"
 }
 
-/// For people: what held, Table 1, and where the rest is.
+/// Returns a summary: Table 1, speed-ups, verdicts, and the path of the page.
 pub(super) fn text(study: &Study, out: &Path) -> String {
     let [w, h] = study.size;
     let mut text = format!(

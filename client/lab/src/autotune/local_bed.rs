@@ -14,7 +14,7 @@ const PIXELS: usize = 3072;
 /// Seconds for which frames of a setting are timed, once there are enough for a median.
 const SECONDS: f64 = 0.25;
 
-/// How the frames of a setting are timed.
+/// Method of timing the frames of a setting.
 pub enum Clock<'a> {
     /// By plain drawing without a scheduler, as `slabcast lab bench` does.
     Plain(Cut),

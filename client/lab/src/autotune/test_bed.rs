@@ -1,5 +1,4 @@
-//! Where settings are tried: in this process, which has the volume and the reference, or on a
-//! cluster.
+//! The interface to try settings, in this process or on a cluster.
 
 use super::setting::Setting;
 use super::trial::Deviation;

@@ -101,7 +101,7 @@ pub(crate) struct Judged {
     pub(crate) sha256: String,
 }
 
-/// How the time of a setting is measured.
+/// Threads and duration of timing a setting.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Effort {
     pub(crate) cut: Cut,

@@ -158,7 +158,7 @@ impl InvarianceCase<'_> {
         extent.length() / l.vox() / self.shot.quality.thickness + 8.0
     }
 
-    /// How far sums and closing sheets may be off by rounding, as a share of full light; what
+    /// Largest error of sums and closing sheets by rounding, as a share of full light; what
     /// two ways to add the same numbers differ by is at most twice that.
     ///
     /// In a sheet a pixel gets at most (2 R + 1)^2 (2 R + 1 + d) contributions, R = 2 and d = 1:
@@ -175,7 +175,7 @@ impl InvarianceCase<'_> {
         self.sheets() * (a_sheet + 8.0 * f32s) + in_all * f32s
     }
 
-    /// How far a picture with other codes for its normals may be off, as a share of full light.
+    /// Largest error of a picture with other codes for its normals, as a share of full light.
     ///
     /// A code's coordinates are off by up to 1/254 in x and y and twice that in z, of a vector
     /// at least 1/sqrt 3 long: 0.0167 rad, and twice that between two codes of one normal. Light

@@ -40,35 +40,39 @@ use slabcast_session::fail::Fail;
 Examples:
   slabcast lab check                            every case of the table: two minutes
   slabcast lab check --group extreme --long     one group, with its long cases
-  slabcast lab check --list                     which cases there are
+  slabcast lab check --list                     names of the cases
   slabcast lab check matrix --pairwise          every pair of settings at least once: minutes
   slabcast lab check matrix brain.nii.gz        all of them: an hour
-  slabcast lab check convergence                how fast thin sheets come to the limit: a minute
-  slabcast lab check colour-rule brain.nii.gz   what each rule of compositing buys and costs
+  slabcast lab check convergence                error by thickness of the sheets: a minute
+  slabcast lab check colour-rule brain.nii.gz   error and time of each compositing rule
   slabcast lab check golden --verify tests/golden.txt"
 )]
 pub struct CheckArgs {
     #[command(subcommand)]
-    what: Option<What>,
+    campaign: Option<Campaign>,
     #[command(flatten)]
     table: table::TableArgs,
 }
 
+/// A campaign of its own, beside the table of cases.
 #[derive(clap::Subcommand, Clone, Debug)]
-enum What {
+enum Campaign {
     Matrix(matrix::MatrixArgs),
     Golden(golden::GoldenArgs),
     Convergence(Box<convergence::ConvergenceArgs>),
     ColourRule(Box<colour_rule::ColourRuleArgs>),
 }
 
-/// Runs the command.
+/// Runs `slabcast lab check`: the table of cases, or the named campaign.
+///
+/// # Errors
+/// The arguments or the volume are refused, a case fails, or the user stopped it.
 pub fn run(args: &CheckArgs) -> Result<(), Fail> {
-    match &args.what {
+    match &args.campaign {
         None => table::run(&args.table),
-        Some(What::Matrix(args)) => matrix::run(args),
-        Some(What::Golden(args)) => golden::run(args),
-        Some(What::Convergence(args)) => convergence::run(args),
-        Some(What::ColourRule(args)) => colour_rule::run(args),
+        Some(Campaign::Matrix(args)) => matrix::run(args),
+        Some(Campaign::Golden(args)) => golden::run(args),
+        Some(Campaign::Convergence(args)) => convergence::run(args),
+        Some(Campaign::ColourRule(args)) => colour_rule::run(args),
     }
 }

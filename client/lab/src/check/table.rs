@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 pub(crate) struct Group {
     /// Name as given to `--group`: one or two words.
     pub(crate) name: &'static str,
-    /// What the group tests, for `--list`.
+    /// Description of the group, for `--list`.
     pub(crate) about: &'static str,
     /// Its cases, in the order of the table.
     pub(crate) cases: fn() -> Vec<Case>,

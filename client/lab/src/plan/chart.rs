@@ -1,4 +1,4 @@
-//! The chart of a plan: efficiency up, workers across, and below what binds.
+//! The chart of a plan: efficiency by number of workers, and below it the bounding resource.
 
 use super::predict::{Bound, Row};
 use crate::chart::{Anchor, Box2, Draw, Mark, Sheet, Theme, width};
@@ -7,20 +7,20 @@ use plotters::prelude::DrawingBackend;
 type Failed = Box<dyn std::error::Error + Send + Sync>;
 
 const WIDE: u32 = 1000;
-/// What lies between the axes.
-const ROOM: Box2 = Box2 { x0: 84.0, y0: 84.0, x1: 806.0, y1: 440.0 };
-/// Where the strips that say what binds begin, and how far they are apart.
+/// The plot area between the axes, in pixels.
+const PLOT_AREA: Box2 = Box2 { x0: 84.0, y0: 84.0, x1: 806.0, y1: 440.0 };
+/// Position of the first strip of bounding resources, and the distance between strips, in pixels.
 const STRIPS: (f64, f64) = (500.0, 26.0);
-/// Half a strip's height, and how far it goes beyond its first and last cluster.
+/// Half the height of a strip, and its overhang beyond the first and last cluster, in pixels.
 const HALF: f64 = 8.0;
-/// Resources and their places among a theme's colours.
+/// Bounding resources and the indices of their colours.
 const BOUNDS: [(Bound, usize); 4] =
     [(Bound::Cores, 2), (Bound::Straggler, 4), (Bound::Link, 3), (Bound::Master, 6)];
 
-/// What is drawn of a row.
+/// Returns the drawn value of a row.
 type Figure = fn(&Row) -> Option<f64>;
 
-/// What is drawn of a schedule: its name, its mark, and its places among a theme's colours under either schedule.
+/// Lines drawn for a schedule: name, value, mark, and colour index for the first and second schedule.
 const FIGURES: [(&str, Figure, Mark, [usize; 2]); 2] = [
     ("latency", |r| Some(r.latency_efficiency), Mark::Dot, [0, 1]),
     ("throughput", |r| r.throughput.map(|t| t.1), Mark::Square, [5, 4]),
@@ -38,25 +38,25 @@ impl Chart<'_> {
         self.schedules.iter().flat_map(|s| s.1)
     }
 
-    /// Where workers stand. With fewer than two there is no axis.
+    /// Returns the axis of workers, for at least two.
     fn axis(&self) -> Axis {
         Axis { most: self.rows().map(|r| r.workers).max().unwrap_or(1).max(2) }
     }
 }
 
-/// The axis of workers, up to the most, in even steps for each doubling.
+/// The logarithmic axis of workers.
 struct Axis {
     most: u32,
 }
 
 impl Axis {
-    /// Where so many stand.
+    /// Returns the x position of a number of workers.
     fn x(&self, workers: u32) -> f64 {
         let doublings = |n: u32| libm::log2(f64::from(n.max(1)));
-        ROOM.x0 + (ROOM.x1 - ROOM.x0) * doublings(workers) / doublings(self.most)
+        PLOT_AREA.x0 + (PLOT_AREA.x1 - PLOT_AREA.x0) * doublings(workers) / doublings(self.most)
     }
 
-    /// Powers of two, and the most workers where there is room for them.
+    /// Returns the ticks: powers of two, and the most workers if there is room.
     fn ticks(&self) -> Vec<u32> {
         let most = self.most;
         let mut ticks: Vec<u32> = (0..32).map(|i| 1 << i).take_while(|n| *n <= most).collect();
@@ -67,7 +67,8 @@ impl Axis {
         ticks
     }
 
-    /// What binds a schedule's clusters, from where to where along the axis; each cluster reaches halfway to its neighbours.
+    /// Returns the bounding resources along the axis with start and end of each. A cluster reaches
+    /// halfway to its neighbours.
     fn strip(&self, rows: &[Row]) -> Vec<(Bound, f64, f64)> {
         let mut strip: Vec<(Bound, f64, f64)> = Vec::new();
         for (i, row) in rows.iter().enumerate() {
@@ -75,11 +76,11 @@ impl Axis {
             let edge = |other: Option<&Row>, end: f64| {
                 other.map_or(end, |o| (own + self.x(o.workers)) / 2.0)
             };
-            let from = edge(i.checked_sub(1).and_then(|i| rows.get(i)), own - HALF);
-            let to = edge(rows.get(i + 1), own + HALF);
+            let start = edge(i.checked_sub(1).and_then(|i| rows.get(i)), own - HALF);
+            let end = edge(rows.get(i + 1), own + HALF);
             match strip.last_mut() {
-                Some((bound, _, end)) if *bound == row.bound.0 => *end = to,
-                _ => strip.push((row.bound.0, from, to)),
+                Some((bound, _, last_end)) if *bound == row.bound.0 => *last_end = end,
+                _ => strip.push((row.bound.0, start, end)),
             }
         }
         strip
@@ -99,27 +100,35 @@ impl Draw for Chart<'_> {
         on.text(self.note, (22.0, 54.0), 12.0, Anchor::Left, theme.faint)?;
         let axis = self.axis();
         let values = self.rows().flat_map(|r| FIGURES.iter().filter_map(|f| f.1(r)));
-        // Frames that come a little early have more than all cores.
+        // Frames that arrive a little early have an efficiency above 1.
         let ceiling = values.fold(1.0, f64::max);
-        let y = |e: f64| ROOM.y1 - (ROOM.y1 - ROOM.y0) * e / ceiling;
+        let y = |e: f64| PLOT_AREA.y1 - (PLOT_AREA.y1 - PLOT_AREA.y0) * e / ceiling;
         for tenth in (0..=10).step_by(2) {
             let at = y(f64::from(tenth) / 10.0);
-            on.line(&[(ROOM.x0, at), (ROOM.x1, at)], 1.0, theme.grid)?;
+            on.line(&[(PLOT_AREA.x0, at), (PLOT_AREA.x1, at)], 1.0, theme.grid)?;
             let word = format!("{} %", tenth * 10);
-            on.text(&word, (ROOM.x0 - 12.0, at + 4.0), 12.0, Anchor::Right, theme.ink)?;
+            on.text(&word, (PLOT_AREA.x0 - 12.0, at + 4.0), 12.0, Anchor::Right, theme.ink)?;
         }
         for n in axis.ticks() {
             let at = axis.x(n);
-            on.line(&[(at, ROOM.y0), (at, ROOM.y1)], 1.0, theme.grid)?;
-            on.text(&n.to_string(), (at, ROOM.y1 + 20.0), 12.0, Anchor::Middle, theme.ink)?;
+            on.line(&[(at, PLOT_AREA.y0), (at, PLOT_AREA.y1)], 1.0, theme.grid)?;
+            on.text(&n.to_string(), (at, PLOT_AREA.y1 + 20.0), 12.0, Anchor::Middle, theme.ink)?;
         }
-        on.line(&[(ROOM.x0, ROOM.y0), (ROOM.x0, ROOM.y1), (ROOM.x1, ROOM.y1)], 1.2, theme.ink)?;
-        let middle = ((ROOM.x0 + ROOM.x1) / 2.0, (ROOM.y0 + ROOM.y1) / 2.0);
-        on.text("workers", (middle.0, ROOM.y1 + 38.0), 13.0, Anchor::Middle, theme.ink)?;
+        on.line(
+            &[
+                (PLOT_AREA.x0, PLOT_AREA.y0),
+                (PLOT_AREA.x0, PLOT_AREA.y1),
+                (PLOT_AREA.x1, PLOT_AREA.y1),
+            ],
+            1.2,
+            theme.ink,
+        )?;
+        let middle = ((PLOT_AREA.x0 + PLOT_AREA.x1) / 2.0, (PLOT_AREA.y0 + PLOT_AREA.y1) / 2.0);
+        on.text("workers", (middle.0, PLOT_AREA.y1 + 38.0), 13.0, Anchor::Middle, theme.ink)?;
         on.upwards("of what so many cores could do", (22.0, middle.1), 13.0, theme.ink)?;
 
-        let legend = ROOM.x1 + 30.0;
-        let mut down = ROOM.y0 + 8.0;
+        let legend = PLOT_AREA.x1 + 30.0;
+        let mut down = PLOT_AREA.y0 + 8.0;
         for (i, (schedule, rows)) in self.schedules.iter().enumerate() {
             for (name, value, mark, colours) in FIGURES {
                 let colour = theme.colours[colours[i % 2]];
@@ -150,7 +159,7 @@ impl Draw for Chart<'_> {
         }
         for (i, (schedule, rows)) in self.schedules.iter().enumerate() {
             let at = STRIPS.0 + STRIPS.1 * i as f64;
-            on.text(schedule, (ROOM.x0 - 14.0, at + 4.0), 12.0, Anchor::Right, theme.ink)?;
+            on.text(schedule, (PLOT_AREA.x0 - 14.0, at + 4.0), 12.0, Anchor::Right, theme.ink)?;
             for (bound, x0, x1) in axis.strip(rows) {
                 let colour = BOUNDS.iter().find(|b| b.0 == bound).map_or(0, |b| b.1);
                 let own = Box2 { x0, y0: at - HALF, x1, y1: at + HALF };
@@ -188,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn what_binds_is_a_strip_without_gaps_in_which_words_have_room() {
+    fn strip_of_bounds_has_no_gaps_and_labels_that_fit() {
         // As the link and the master bind by turns where clusters are large and close to each other.
         let bound = |n: u32| {
             if n < 20 { Bound::Cores } else { [Bound::Link, Bound::Master][(n % 2) as usize] }
@@ -199,7 +208,10 @@ mod tests {
         let strip = chart.axis().strip(&rows);
         assert_eq!(strip.len(), 46, "cores, and then each by itself");
         assert!(strip.windows(2).all(|w| w[0].2 == w[1].1 && w[0].1 < w[0].2), "{strip:?}");
-        assert!(strip[0].1 < ROOM.x0 && strip[45].2 > ROOM.x1, "ends stand about their points");
+        assert!(
+            strip[0].1 < PLOT_AREA.x0 && strip[45].2 > PLOT_AREA.x1,
+            "ends stand about their points"
+        );
         let drawn = svg(&chart, &LIGHT).unwrap();
         // In the strip and in the legend, or in the legend alone.
         let said = |name: &str| drawn.lines().filter(|l| l.trim() == name).count();
@@ -207,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_is_drawn_is_in_the_legend_and_one_cluster_is_a_chart() {
+    fn legend_has_only_drawn_lines_and_one_cluster_makes_a_chart() {
         let rows = [row(3, Bound::Cores)];
         let schedules = [("region", &rows[..]), ("slab, 3 slabs", &rows[..])];
         let chart = Chart { title: "t", note: "", schedules: &schedules };

@@ -281,8 +281,8 @@ impl Bench {
         let edges: BTreeSet<u32> = match path.work.tile {
             Some(edge) => [edge].into(),
             None => {
-                let of = |w: &u64| macrotile::cut(size, &rects, shut, cull, *w, None).edge;
-                path.wanted.iter().map(of).chain(path.edges.iter().copied()).collect()
+                let edge_for = |w: &u64| macrotile::cut(size, &rects, shut, cull, *w, None).edge;
+                path.wanted.iter().map(edge_for).chain(path.edges.iter().copied()).collect()
             }
         };
         let (mut levels, mut first) = (Vec::new(), Vec::new());
@@ -427,7 +427,7 @@ impl Bench {
         let simd = Simd::detect();
         let repeats = self.repeats;
         let mut pixels = TilePixels::default();
-        let mut of = |edge: u32| {
+        let mut time_ns = |edge: u32| {
             let outlook = VisibleBricks::new(&frame.view, bricks.directory());
             let tiles: Vec<Rect> =
                 direct::tile_rects(whole, edge).filter(|tile| outlook.weight(tile) > 0).collect();
@@ -440,7 +440,7 @@ impl Bench {
             times.iter().sum::<u64>() + outlook.projected_blocks().count() as u64 * looked.block_ns
         };
         let edges = [64, 128, 256].into_iter().filter(|e| *e as i32 <= whole.x1.max(whole.y1) * 2);
-        let timed = edges.map(|edge| (edge, of(edge)));
+        let timed = edges.map(|edge| (edge, time_ns(edge)));
         timed.min_by_key(|t| t.1).unwrap_or((64, 0))
     }
 }
@@ -469,8 +469,8 @@ impl<'a> Clocked<'a> {
     /// Returns the time of the first request of each brick, in thousandths of the time until now.
     fn needed(&self, touched: &[u32]) -> Vec<u16> {
         let (all, came) = (self.began.elapsed().as_secs_f64().max(1e-9), self.came.borrow());
-        let of = |place| came.get(place).map_or(0.0, Duration::as_secs_f64) / all;
-        touched.iter().map(|place| (1000.0 * of(place)) as u16).collect()
+        let share = |place| came.get(place).map_or(0.0, Duration::as_secs_f64) / all;
+        touched.iter().map(|place| (1000.0 * share(place)) as u16).collect()
     }
 }
 
@@ -559,7 +559,7 @@ mod tests {
         ("aneurism.nrrd", "+z", "peer-vessels"),
     ];
 
-    /// Four views of 512x512 of it, or nothing, which is said, where the volume is not here.
+    /// Returns four views of 512x512, or `None` with a note if the volume is not here.
     fn staged((file, axis, tf): Named) -> Option<PathScenes> {
         let (volume, orientation) = slabcast_session::testing::data_volume(file, axis)?;
         let info = volume.info(volume.digest());
@@ -569,7 +569,7 @@ mod tests {
         Some(PathScenes::new(&volume, &info, &request, orientation).expect("a scenes"))
     }
 
-    /// Bytes of a frame's results and what a tile takes to write and to read, for docs/scaling.md.
+    /// Measures the bytes of a frame's results, and the time to write and read a tile.
     #[test]
     #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_a_tile -- --ignored --nocapture"]
     fn what_a_tile_weighs_and_takes_to_pack() {
@@ -613,8 +613,8 @@ mod tests {
         }
     }
 
-    /// What is left to do of a picture of finished tiles when its last one has come, if all are laid then and if those before
-    /// were. All tiles are full, and the picture's memory is new. For docs/scaling.md.
+    /// Measures assembling a frame after its last tile, with all tiles left or only the last 16. All
+    /// tiles are full, and the memory of the frame is new.
     #[test]
     #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_is_left -- --ignored --nocapture"]
     fn what_is_left_at_the_last_tile() {
@@ -646,8 +646,8 @@ mod tests {
         }
     }
 
-    /// What looking at bricks takes: all of a volume, those that a frame needs, and those that a worker
-    /// of fifteen needs which draws neighbouring tiles of it. For docs/scaling.md.
+    /// Measures projecting bricks: all of a volume, those that a frame needs, and those that a worker of
+    /// fifteen needs, which draws neighbouring tiles of it.
     #[test]
     #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_looking -- --ignored --nocapture"]
     fn what_looking_at_bricks_takes() {
@@ -708,8 +708,8 @@ mod tests {
         }
     }
 
-    /// What bricks weigh, and what lz4 makes of them and takes, of each by itself and of messages of some 64 KiB.
-    /// Packed they would be once, in the store; unpacked by each worker. For docs/scaling.md.
+    /// Measures bytes, compression ratio and time of bricks with lz4, each by itself and in messages of
+    /// some 64 KiB.
     #[test]
     #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_bricks -- --ignored --nocapture"]
     fn what_bricks_weigh_and_take_to_pack() {
@@ -782,7 +782,7 @@ mod tests {
         shortest(9, read).0
     }
 
-    /// Bytes that nothing packs.
+    /// Returns incompressible bytes.
     fn noise(n: usize) -> Vec<u8> {
         let mut x = 1u64;
         let next = || {

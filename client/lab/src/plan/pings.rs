@@ -187,9 +187,9 @@ mod tests {
 
     #[test]
     fn least_takes_the_cheaper_measurement() {
-        let of = |a, c| Pings { alone_ns: [a, 20, 20], company_ns: [c, 5, 5] };
-        assert_eq!(least(of(14, 2), of(20, 1)), of(14, 1));
-        assert_eq!(least(of(20, 1), of(14, 2)), of(14, 1));
+        let pings = |a, c| Pings { alone_ns: [a, 20, 20], company_ns: [c, 5, 5] };
+        assert_eq!(least(pings(14, 2), pings(20, 1)), pings(14, 1));
+        assert_eq!(least(pings(20, 1), pings(14, 2)), pings(14, 1));
     }
 
     /// `cargo test --release -p slabcast --bin slabcast what_a_message -- --ignored --nocapture`, on a machine with

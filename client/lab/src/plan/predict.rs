@@ -289,8 +289,10 @@ pub(crate) fn orders(
         let job = FrameJob { frame: FrameId(1), number: 0, ..jobs[i].clone() };
         let one = Trace { frames: vec![trace.frames[i].clone()], ..trace.clone() };
         let plain = stats_of(&[job], &one)?;
-        let of = |stats: Option<&FrameStats>| stats.and_then(|s| correlation(s, i));
-        if let (Some(plain), Some(learned)) = (of(plain.first()), of(learned.get(i))) {
+        let view_correlation = |stats: Option<&FrameStats>| stats.and_then(|s| correlation(s, i));
+        if let (Some(plain), Some(learned)) =
+            (view_correlation(plain.first()), view_correlation(learned.get(i)))
+        {
             sum = [sum[0] + plain, sum[1] + learned];
             views += 1;
         }

@@ -41,7 +41,7 @@ pub(super) fn files(out: &Path, report: &Report) -> Result<(), Fail> {
     Ok(())
 }
 
-/// All of it.
+/// Returns the report as JSON.
 pub(super) fn json(report: &Report) -> String {
     serde_json::to_string_pretty(report).unwrap_or_default() + "\n"
 }

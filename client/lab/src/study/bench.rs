@@ -196,8 +196,8 @@ impl Bench<'_> {
             if measured_path.trace.frames.len() == n {
                 let is_radius = name.starts_with("radius");
                 let setting = effects::Setting::new(name, &measured_path, stretch)?;
-                let of = &mut study.effects;
-                if is_radius { of.radii.push(setting) } else { of.sizes.push(setting) }
+                let effects = &mut study.effects;
+                if is_radius { effects.radii.push(setting) } else { effects.sizes.push(setting) }
             }
         }
         self.progress.end();

@@ -9,7 +9,7 @@ use slabcast_common::quality::Schedule;
 use slabcast_common::stats::FrameStats;
 use slabcast_session::fail::Fail;
 
-/// Where a figure comes from.
+/// Origin of a figure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Origin {
@@ -163,7 +163,7 @@ pub(super) struct Data {
 
 /// Returns Figure 4 at the paper's pace. All `relevant` voxels have `bytes` bytes when sent.
 pub(super) fn data(runs: &[Run], relevant: u64, bytes: u64) -> Vec<Data> {
-    let of = |slabs: u32| {
+    let data_of_slabs = |slabs: u32| {
         let here = |r: &&Run| r.is(Origin::Predicted, Pace::Paper, Some(slabs));
         // Needed and sent data do not depend on the number of nodes.
         let run = runs.iter().filter(here).find(|r| r.nodes == NODES[1])?;
@@ -193,5 +193,5 @@ pub(super) fn data(runs: &[Run], relevant: u64, bytes: u64) -> Vec<Data> {
             broadcast_ms: runs.iter().filter(of_paper).map(broadcast).collect(),
         })
     };
-    SLABS.into_iter().filter_map(of).collect()
+    SLABS.into_iter().filter_map(data_of_slabs).collect()
 }

@@ -19,7 +19,7 @@ use slabcast_session::fail::Fail;
 use slabcast_sim::{Costs, Link, Observer, one_core_ms};
 use slabcast_trace::Trace;
 
-/// How fast tiles are drawn.
+/// Speed at which tiles are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Pace {

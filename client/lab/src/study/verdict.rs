@@ -124,8 +124,8 @@ fn order(study: &Study, all: &mut Vec<Verdict>) {
 }
 
 fn nodes(study: &Study, all: &mut Vec<Verdict>) {
-    let of = |n: u32| study.figure_3.iter().find(|b: &&Breakdown| b.nodes == n);
-    let (Some(many), Some(few)) = (of(NODES[4]), of(NODES[1])) else { return };
+    let breakdown = |n: u32| study.figure_3.iter().find(|b: &&Breakdown| b.nodes == n);
+    let (Some(many), Some(few)) = (breakdown(NODES[4]), breakdown(NODES[1])) else { return };
     let most = many.shares[1].max(few.shares[1]);
     all.push(Verdict {
         place: "5.1, Figure 3",
@@ -197,8 +197,8 @@ fn tiles(study: &Study, all: &mut Vec<Verdict>) {
 }
 
 fn data(study: &Study, all: &mut Vec<Verdict>) {
-    let of = |n: u32| study.figure_4.iter().find(|d: &&Data| d.slabs == n);
-    let Some(three) = of(3) else { return };
+    let data = |n: u32| study.figure_4.iter().find(|d: &&Data| d.slabs == n);
+    let Some(three) = data(3) else { return };
     let [least, most] = three.needed;
     all.push(Verdict {
         place: "5.2, Figure 4a",
@@ -245,7 +245,7 @@ fn data(study: &Study, all: &mut Vec<Verdict>) {
             holds: Holds::from_conditions(hi <= 2.0 * lo, hi <= 3.0 * lo),
         });
     }
-    let Some(five) = of(5) else { return };
+    let Some(five) = data(5) else { return };
     all.push(Verdict {
         place: "5.2, Figure 4a",
         paper: "three slabs keep more data for a view than five".into(),

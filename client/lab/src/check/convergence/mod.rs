@@ -46,7 +46,7 @@ pub(crate) struct ConvergenceArgs {
     #[arg(long, value_name = "N", default_value = "512",
           value_parser = clap::value_parser!(u32).range(1..=1 << 26))]
     pixels: u32,
-    /// Which sample of pixels
+    /// Seed of the sample of pixels
     #[arg(long, value_name = "N", default_value = "1")]
     seed: u64,
     /// The thinnest sheets are 1/N vox thick, N a power of two

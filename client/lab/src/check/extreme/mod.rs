@@ -28,7 +28,7 @@ use slabcast_session::embedded::WorkerGroup;
 /// Pixels of a case that are judged: one cell in eleven of a picture of 61x47.
 const PIXELS: usize = 256;
 
-/// Those where a ray meets thousands of voxels.
+/// Scenes in which a ray meets thousands of voxels.
 const FEW: usize = 8;
 
 /// Returns the cases of the group.

@@ -1,5 +1,5 @@
-//! Ablation of a scene, for `slabcast lab explain` without a pixel: what the renderer leaves out, and
-//! what that saves.
+//! Ablation of a scene, for `slabcast lab explain` without a pixel: what the renderer leaves out,
+//! and what that saves.
 //!
 //! Each row is measured. The scene is drawn as it is and with the thing kept (or the test switched
 //! off), in turn, and the two pictures are compared to the bit.

@@ -1,8 +1,9 @@
 //! Charts as SVG and as PNG, on a light and on a dark ground.
 //!
-//! Drawn by plotters: its SVG writer, and its bitmap writer with a font that is part of the program,
-//! since a node of a cluster may have none. One drawing function serves both; [`Sheet`] hides the
-//! writer and the size of a pixel. Text is measured in the same font, so that labels never overlap.
+//! Drawn by plotters: its SVG writer, and its bitmap writer with a font that is part of the
+//! program, since a node of a cluster may have none. One drawing function serves both; [`Sheet`]
+//! hides the writer and the size of a pixel. Text is measured in the same font, so that labels
+//! never overlap.
 
 use ab_glyph::{Font, FontRef, ScaleFont};
 use plotters::coord::Shift;
@@ -34,8 +35,8 @@ pub(crate) struct Theme {
     pub(crate) ink: RGBColor,
     pub(crate) faint: RGBColor,
     pub(crate) grid: RGBColor,
-    /// Colours of up to eight series: those of Okabe and Ito, which most colour-blind readers can tell
-    /// apart, darkened or lightened for the background.
+    /// Colours of up to eight series: those of Okabe and Ito, which most colour-blind readers can
+    /// tell apart, darkened or lightened for the background.
     pub(crate) colours: [RGBColor; 8],
 }
 
@@ -267,8 +268,8 @@ impl Box2 {
     }
 }
 
-/// Returns a position for the label of a point that stays in `room` and covers nothing in `taken`: the
-/// left end of its base line, and its box. Near positions are tried first.
+/// Returns a position for the label of a point that stays in `room` and covers nothing in `taken`:
+/// the left end of its base line, and its box. Near positions are tried first.
 pub(crate) fn place(
     text: &str,
     size: f64,
@@ -421,8 +422,8 @@ pub(crate) struct LogAxis {
 }
 
 impl LogAxis {
-    /// Returns an axis over all values above zero, with ticks at 1, 2 and 5 of each power of ten (at 1
-    /// alone, if these are too many).
+    /// Returns an axis over all values above zero, with ticks at 1, 2 and 5 of each power of ten
+    /// (at 1 alone, if these are too many).
     pub(crate) fn over(values: impl Iterator<Item = f64>) -> LogAxis {
         let (mut lo, mut hi) = (f64::INFINITY, f64::NEG_INFINITY);
         for v in values.filter(|v| v.is_finite() && *v > 0.0) {

@@ -1,9 +1,9 @@
 //! `slabcast lab explain`: explains the colour of a pixel sheet by sheet, or the savings of a scene
 //! ([`crate::ablation`]).
 //!
-//! The numbers are the renderer's own ([`slabcast_render::oracle::explain`]): they lead to the pixel
-//! of the picture, to the bit. Each line has the transmittance of f64 sheets for comparison, and
-//! below all lines stands the limit.
+//! The numbers are the renderer's own ([`slabcast_render::oracle::explain`]): they lead to the
+//! pixel of the picture, to the bit. Each line has the transmittance of f64 sheets for comparison,
+//! and below all lines stands the limit.
 
 use crate::ablation;
 use crate::single_frame::SingleFrame;
@@ -23,8 +23,8 @@ use std::fmt::Write;
 /// Without: what the scene leaves out, and what that saves.
 ///
 /// The first view of the path is taken. Without --pixel the scene is drawn as it is and with each
-/// thing kept that it leaves out, in turn, and the pictures are compared. With --pixel, each line is
-/// a sheet that holds something there, front to back: its optical depth tau, its colour, the
+/// thing kept that it leaves out, in turn, and the pictures are compared. With --pixel, each line
+/// is a sheet that holds something there, front to back: its optical depth tau, its colour, the
 /// transmittance T behind it, T by f64 sheets that round and shut nothing, and how many voxels of
 /// how many bricks it is made of, the strongest first. All other numbers are the renderer's own, in
 /// its arithmetic: they lead to the pixel of the picture to the bit. Below stand the pixel, the

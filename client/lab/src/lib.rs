@@ -1,4 +1,4 @@
-//! The laboratory: how far pictures are from the truth, what they cost, and what a cluster would do.
+//! The laboratory: how far pictures are from the truth, what they cost, and what clusters do.
 //!
 //! One module per subcommand of `slabcast lab`; each has its arguments and a `run` function:
 //!

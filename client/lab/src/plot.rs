@@ -1,8 +1,8 @@
 //! Log-log figures of errors, as SVG.
 //!
-//! Drawn by the SVG writer of plotters. The viewer may use another font than the text was measured in
-//! ([`crate::chart`]), so the layout does not depend on it: ticks are few, the legend has its own
-//! place below the panels, and slopes are named where their lines end.
+//! Drawn by the SVG writer of plotters. The viewer may use another font than the text was measured
+//! in ([`crate::chart`]), so the layout does not depend on it: ticks are few, the legend has its
+//! own place below the panels, and slopes are named where their lines end.
 //!
 //! The background is opaque and light, so that a figure looks the same on a light and a dark page.
 
@@ -144,8 +144,8 @@ impl LogLog {
         Ok(())
     }
 
-    /// Returns the point where the guides meet: below all points at the largest x, since errors grow
-    /// to the right and leave that corner free.
+    /// Returns the point where the guides meet: below all points at the largest x, since errors
+    /// grow to the right and leave that corner free.
     fn fan(&self, x: [f64; 2], y: [f64; 2]) -> (f64, f64) {
         let right = x[1] - MARGIN;
         let least = self

@@ -29,8 +29,8 @@ const RMSE_MARGIN: f64 = 1.2;
 /// Least ratio of the promised error of 99.9 % of the pixels to the measured one. Of 3072 pixels
 /// about a third are not blank, so the second worst of these decides.
 const MAX_ERROR_MARGIN: f64 = 1.5;
-/// Least ratio of the budget to the measured frame time. A few frames stand for all, and the runs of
-/// one machine differ.
+/// Least ratio of the budget to the measured frame time. A few frames stand for all, and the runs
+/// of one machine differ.
 const TIME_MARGIN: f64 = 1.1;
 /// Rungs tried beyond the first that meets (or misses) the target; one of them may be better.
 const EXTRA_RUNGS: usize = 3;
@@ -315,8 +315,8 @@ pub fn trial(
     Trial::new(volume.clone(), info.clone(), &around, orientation, threads)
 }
 
-/// Chooses the quality of a request that has a target, by plain drawing on `threads` threads; leaves
-/// one without a target as it is. The request must fit the volume.
+/// Chooses the quality of a request that has a target, by plain drawing on `threads` threads;
+/// leaves one without a target as it is. The request must fit the volume.
 pub(crate) fn settle(
     volume: &Arc<Volume>,
     info: &VolumeInfo,

@@ -294,8 +294,8 @@ impl TestBed for ClusterBed<'_> {
     }
 }
 
-/// Returns the path that settings are tried on. For a turntable, [`VIEWS`] views all around, so that
-/// measurements serve any turn of the scene; any other path is returned as it is.
+/// Returns the path that settings are tried on. For a turntable, [`VIEWS`] views all around, so
+/// that measurements serve any turn of the scene; any other path is returned as it is.
 pub(crate) fn all_around(path: &ViewPath) -> ViewPath {
     let mut path = path.clone();
     if let Some(turn) = &mut path.turntable {

@@ -14,9 +14,9 @@ pub(crate) struct Point {
 /// half a percent, on mri256 in `peer-semi`).
 pub(crate) const WORTH: f64 = 0.02;
 
-/// Returns the indices of the Pareto front, from fast to slow: each point's error is lower than that
-/// of every faster one by [`WORTH`] or more. Of equal points the first is taken; points that are
-/// not finite are left out.
+/// Returns the indices of the Pareto front, from fast to slow: each point's error is lower than
+/// that of every faster one by [`WORTH`] or more. Of equal points the first is taken; points that
+/// are not finite are left out.
 pub(crate) fn front(points: &[Point]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len())
         .filter(|&i| points[i].ms.is_finite() && points[i].error.is_finite())

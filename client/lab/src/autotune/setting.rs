@@ -9,7 +9,7 @@ use slabcast_common::quality::{Kernel, Quality, Sums};
 pub struct Setting {
     /// Quality at which the picture is drawn.
     pub(crate) quality: Quality,
-    /// Factor by which each edge of the picture is drawn smaller and then magnified; 1 is full size.
+    /// Factor by which each edge of the picture is drawn smaller before it is magnified (1 or more).
     pub(crate) shrink: u32,
     /// Whether voxels are shaded, in a scene with shading.
     pub(crate) shaded: bool,
@@ -28,14 +28,15 @@ impl Setting {
         self.shaded == other.shaded && (a.kernel, a.std, a.radius) == (b.kernel, b.std, b.radius)
     }
 
-    /// Returns the size that is drawn for a picture of `size`, in pixels; `None` where `shrink` does
-    /// not divide it.
+    /// Returns the size that is drawn for a picture of `size`, in pixels; `None` where `shrink`
+    /// does not divide it.
     pub(crate) fn drawn_size(&self, size: [u32; 2]) -> Option<[u32; 2]> {
         let whole = size.iter().all(|n| n % self.shrink == 0);
         whole.then(|| size.map(|n| n / self.shrink))
     }
 
-    /// Returns how the setting differs from `base`, in the words of the flags: `thickness 0.5, i16`.
+    /// Returns how the setting differs from `base` in the words of the flags, such as
+    /// `thickness 0.5, i16`.
     pub(crate) fn name(&self, base: &Setting) -> String {
         let (q, b) = (&self.quality, &base.quality);
         let mut words = Vec::new();

@@ -25,12 +25,12 @@ pub trait TestBed {
     /// Returns the error of a setting's pictures against the truth; draws the truth first.
     ///
     /// # Errors
-    /// The scene can't be drawn at this setting, the job of a cluster fails, or the user stopped it.
+    /// The scene can't be drawn at this setting, the job fails, or the user stopped it.
     fn deviation(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Deviation, Fail>;
     /// Returns the median time of a frame in ms.
     ///
     /// # Errors
-    /// The scene can't be drawn at this setting, the job of a cluster fails, or the user stopped it.
+    /// The scene can't be drawn at this setting, the job fails, or the user stopped it.
     fn ms(&mut self, setting: &Setting) -> Result<f64, Fail>;
 }
 

@@ -4,9 +4,10 @@
 //! splatter) at a stratified sample of pixels, or at all. Each row of the table compares two
 //! pictures that differ in one source of error alone.
 //!
-//! There are two kinds of sources. Thickness, cut-off, slivers, quantisation and rounding lie between
-//! the picture and the limit, and add up to its error. Truncation and ripple lie between the limit
-//! and an ideal. They are errors of the model, no part of the sum, and depend on the kernel only.
+//! There are two kinds of sources. Thickness, cut-off, slivers, quantisation and rounding lie
+//! between the picture and the limit, and add up to its error. Truncation and ripple lie between
+//! the limit and an ideal. They are errors of the model, no part of the sum, and depend on the
+//! kernel only.
 //!
 //! [`report`] prints the result as text or JSON, [`map`] draws it.
 

@@ -20,7 +20,8 @@ const BOUNDS: [(Bound, usize); 4] =
 /// Returns the drawn value of a row.
 type Figure = fn(&Row) -> Option<f64>;
 
-/// Lines drawn for a schedule: name, value, mark, and colour index for the first and second schedule.
+/// Lines drawn for a schedule: name, value, mark, and colour index for the first and second
+/// schedule.
 const FIGURES: [(&str, Figure, Mark, [usize; 2]); 2] = [
     ("latency", |r| Some(r.latency_efficiency), Mark::Dot, [0, 1]),
     ("throughput", |r| r.throughput.map(|t| t.1), Mark::Square, [5, 4]),
@@ -198,7 +199,8 @@ mod tests {
 
     #[test]
     fn strip_of_bounds_has_no_gaps_and_labels_that_fit() {
-        // As the link and the master bind by turns where clusters are large and close to each other.
+        // As the link and the master bind by turns where clusters are large and close to each
+        // other.
         let bound = |n: u32| {
             if n < 20 { Bound::Cores } else { [Bound::Link, Bound::Master][(n % 2) as usize] }
         };

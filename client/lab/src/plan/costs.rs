@@ -1,7 +1,8 @@
 //! The processor time of messages.
 //!
-//! It has two parts. Converting pixels to messages and back is timed here. The time of gRPC, TCP and
-//! the kernel follows from the pings of the machine that drew the tiles ([`pings`](super::pings)).
+//! It has two parts. Converting pixels to messages and back is timed here. The time of gRPC, TCP
+//! and the kernel follows from the pings of the machine that drew the tiles
+//! ([`pings`](super::pings)).
 
 use super::clock::cpu_ns;
 use super::measure::FINISH;
@@ -24,8 +25,8 @@ use std::time::Instant;
 /// (Zen 3, 2 vCPU), on which waking a processor costs 20 us.
 const KNOWN_PINGS: Pings =
     Pings { alone_ns: [22_400, 40_100, 35_500], company_ns: [2_000, 7_600, 7_000] };
-/// gRPC's share of a message's time without waking; the rest is the socket's. On that machine 0.8 us
-/// (TRANSPORT.md, answer 1) of 3.65 us a message at either end.
+/// gRPC's share of a message's time without waking; the rest is the socket's. On that machine 0.8
+/// us (TRANSPORT.md, answer 1) of 3.65 us a message at either end.
 const GRPC_SHARE: f64 = 0.22;
 /// Share of the driver's time for a ping that is the message and not a decision. In a rehearsal
 /// (mri256 at 1024x1024, four workers, that machine) 15 % of 1.85 ms a frame were neither decisions
@@ -180,8 +181,8 @@ fn region_bytes(trace: &Trace) -> Option<f64> {
     (pixels > 0.0).then(|| bytes / pixels)
 }
 
-/// Returns a region of 64x64 pixels with as many bytes as the average of the trace after compression
-/// to a half, as drawn pixels compress.
+/// Returns a region of 64x64 pixels with as many bytes as the average of the trace after
+/// compression to a half, as drawn pixels compress.
 fn sample_region(trace: &Trace) -> SparseTile {
     let bytes = region_bytes(trace).unwrap_or(0.5) * 64.0 * 64.0;
     let tile = Rect::new(0, 0, 64, 64);

@@ -1,16 +1,16 @@
 //! The measured half of a prediction: draws every tile that a schedule may ask for, on one core.
 //!
 //! Every tile of a level is drawn several times as a worker draws it, from the same bricks and the
-//! same state. Its shortest processor time counts, since disturbances (a cold cache, the first touch
-//! of a page) only ever lengthen it.
+//! same state. Its shortest processor time counts, since disturbances (a cold cache, the first
+//! touch of a page) only ever lengthen it.
 //!
 //! A worker projects bricks once a frame: blocks of bricks when the frame begins, the bricks of a
 //! block when a tile first needs them ([`slabcast_render::visibility`]). So the time of a tile is
 //! measured with its blocks projected. The tile lists them, and the time of a block is measured
 //! apart. The simulation charges each block of a frame once to a worker, with its first tile.
 //!
-//! A tile of one part is drawn once more to record when it needs each brick: a worker that lacks the
-//! brick draws up to that point.
+//! A tile of one part is drawn once more to record when it needs each brick: a worker that lacks
+//! the brick draws up to that point.
 
 use super::clock::cpu_ns;
 use prost::Message;
@@ -153,7 +153,8 @@ impl Packed {
         Packing { pack_ns: mean(self.pack_ns), unpack_ns: mean(self.unpack_ns) }
     }
 
-    /// Returns the bytes of a result message, compressed and plain, and adds the times of compression.
+    /// Returns the bytes of a result message, compressed and plain, and adds the times of
+    /// compression.
     fn weigh(&mut self, repeats: u32, leaves: SparseTile, counters: Counters) -> [u32; 2] {
         self.bytes += leaves.data.len() as u64;
         let result = result_message(Pixels::Finished(leaves), counters);
@@ -352,9 +353,9 @@ impl Bench {
         let size = job.view.size;
         let bricks = &path.scenes.bricks;
         let rects: Vec<Rect> = projected.iter().flatten().map(|p| p.rect).collect();
-        // The schedule uses blocks of bricks, whose outline is a little larger, so that it may choose
-        // the level next to the one for bricks. Overlapping frames may each have half the workers,
-        // and a sole frame has some tiles of 64 pixels cut in parts of 32.
+        // The schedule uses blocks of bricks, whose outline is a little larger, so that it may
+        // choose the level next to the one for bricks. Overlapping frames may each have half the
+        // workers, and a sole frame has some tiles of 64 pixels cut in parts of 32.
         let mut edges: BTreeSet<u32> = match job.work.tile {
             // The parts of a large tile record when it needs its bricks.
             Some(edge) => [edge, edge.min(PART_EDGE as u32)].into(),
@@ -571,7 +572,7 @@ mod tests {
 
     /// Measures the bytes of a frame's results, and the time to write and read a tile.
     #[test]
-    #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_a_tile -- --ignored --nocapture"]
+    #[ignore = "measures; cargo test --release -p slabcast-lab what_a_tile -- --ignored --nocapture"]
     fn what_a_tile_weighs_and_takes_to_pack() {
         println!(
             "KB a frame: sums, finished, packed. us a tile: sums written, sums read, finished,"
@@ -613,10 +614,10 @@ mod tests {
         }
     }
 
-    /// Measures assembling a frame after its last tile, with all tiles left or only the last 16. All
-    /// tiles are full, and the memory of the frame is new.
+    /// Measures assembling a frame after its last tile, with all tiles left or only the last 16.
+    /// All tiles are full, and the memory of the frame is new.
     #[test]
-    #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_is_left -- --ignored --nocapture"]
+    #[ignore = "measures; cargo test --release -p slabcast-lab what_is_left -- --ignored --nocapture"]
     fn what_is_left_at_the_last_tile() {
         let full = TilePixels {
             a: vec![0.5; 64 * 64],
@@ -646,10 +647,10 @@ mod tests {
         }
     }
 
-    /// Measures projecting bricks: all of a volume, those that a frame needs, and those that a worker of
-    /// fifteen needs, which draws neighbouring tiles of it.
+    /// Measures projecting bricks: all of a volume, those that a frame needs, and those that a
+    /// worker of fifteen needs, which draws neighbouring tiles of it.
     #[test]
-    #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_looking -- --ignored --nocapture"]
+    #[ignore = "measures; cargo test --release -p slabcast-lab what_looking -- --ignored --nocapture"]
     fn what_looking_at_bricks_takes() {
         println!(
             "edge of blocks: blocks; us, bricks that are looked at: a worker of 15, the frame"
@@ -708,10 +709,10 @@ mod tests {
         }
     }
 
-    /// Measures bytes, compression ratio and time of bricks with lz4, each by itself and in messages of
-    /// some 64 KiB.
+    /// Measures bytes, compression ratio and time of bricks with lz4, each by itself and in
+    /// messages of some 64 KiB.
     #[test]
-    #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_bricks -- --ignored --nocapture"]
+    #[ignore = "measures; cargo test --release -p slabcast-lab what_bricks -- --ignored --nocapture"]
     fn what_bricks_weigh_and_take_to_pack() {
         const MESSAGE: usize = 64 << 10;
         println!("bytes a voxel and a brick; of them packed, %, and us a brick to pack and unpack");

@@ -41,8 +41,9 @@ pub(crate) const GOODPUT: f64 = 0.94;
 ///
 /// Also predicts its efficiency and the bytes it sends.
 ///
-/// First the tiles of the path are drawn and timed here, on one core. Then the scheduler itself runs
-/// with these times against virtual workers and links. The table separates measured from predicted.
+/// First the tiles of the path are drawn and timed here, on one core. Then the scheduler itself
+/// runs with these times against virtual workers and links. The table separates measured from
+/// predicted.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -83,18 +84,18 @@ pub struct PlanArgs {
     /// Trace of measured tiles; read if the file exists, else written
     #[arg(long, value_name = "FILE", help_heading = "Measuring")]
     trace: Option<PathBuf>,
-    /// Compare with real processes: starts a master and this many workers here, which hold each tile
-    /// for its measured time (needs --trace)
+    /// Compare with real processes: starts a master and this many workers here, which hold each
+    /// tile for its measured time (needs --trace)
     #[arg(long, value_name = "LIST", value_parser = parse::workers, requires = "trace",
           help_heading = "Measuring")]
     rehearse: Option<parse::Workers>,
     /// Address at which the rehearsal's master listens, open to anyone who reaches it: one that
-    /// workers reach over a link of --link's rate, such as docs/shaped.sh makes [default: 127.0.0.1,
-    /// unlimited]
+    /// workers reach over a link of --link's rate, such as docs/shaped.sh makes [default:
+    /// 127.0.0.1, unlimited]
     #[arg(long, value_name = "ADDRESS", requires = "rehearse", help_heading = "Measuring")]
     rehearse_at: Option<IpAddr>,
-    /// Command that starts the rehearsal's workers, such as `ip netns exec far`; this program and its
-    /// arguments are appended
+    /// Command that starts the rehearsal's workers, such as `ip netns exec far`; this program and
+    /// its arguments are appended
     #[arg(long, value_name = "COMMAND", requires = "rehearse_at", help_heading = "Measuring")]
     rehearse_by: Option<String>,
     /// Folder for plan.svg, plan.png, plan.json and plan.csv
@@ -108,8 +109,8 @@ pub struct PlanArgs {
     quiet: bool,
 }
 
-/// Runs `slabcast lab plan`: measures or reads the tiles, and prints the prediction as a table or as
-/// JSON; with `--output` also writes chart and tables.
+/// Runs `slabcast lab plan`: measures or reads the tiles, and prints the prediction as a table or
+/// as JSON; with `--output` also writes chart and tables.
 ///
 /// # Errors
 /// The arguments or the volume are refused, the trace is of another path, a rehearsal fails, or a
@@ -193,7 +194,8 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
             };
             let began = Instant::now();
             let mut trace = measure::measure(&measure_args, (&mut progress, 0))?;
-            // Pinging again some time later evens out disturbances; useless at once or after a failure.
+            // Pinging again some time later evens out disturbances; useless at once or after a
+            // failure.
             let later = began.elapsed() > pinging;
             if let Some(before) = pings.filter(|_| later && !signals::stop_requested()) {
                 progress.phase("measuring what messages take");

@@ -1,5 +1,5 @@
-//! Measures the processor time of a message on this machine: a real master and real workers with TCP
-//! between them, in this process.
+//! Measures the processor time of a message on this machine: a real master and real workers with
+//! TCP between them, in this process.
 //!
 //! The pings of one worker are alone: every thread on the way sleeps before each. The pings of many
 //! workers go together, and the master's threads are awake for all but the first. The two times
@@ -192,8 +192,8 @@ mod tests {
         assert_eq!(least(pings(20, 1), pings(14, 2)), pings(14, 1));
     }
 
-    /// `cargo test --release -p slabcast --bin slabcast what_a_message -- --ignored --nocapture`, on a machine with
-    /// nothing else to do.
+    /// `cargo test --release -p slabcast-lab what_a_message -- --ignored --nocapture`,
+    /// on a machine with nothing else to do.
     #[test]
     #[ignore = "measures: wants the machine for itself"]
     fn what_a_message_costs() {

@@ -52,8 +52,8 @@ pub(crate) struct Row {
     pub(crate) frame_ms: f64,
     /// Best time of one core divided by the number of render threads and by `frame_ms`.
     pub(crate) latency_efficiency: f64,
-    /// Frames a second with [`IN_FLIGHT`] frames in flight, and their efficiency; `None` if fewer than
-    /// [`LEAST_STEADY_FRAMES`] frames are steady.
+    /// Frames a second with [`IN_FLIGHT`] frames in flight, and their efficiency; `None` if fewer
+    /// than [`LEAST_STEADY_FRAMES`] frames are steady.
     pub(crate) throughput: Option<(f64, f64)>,
     /// Bytes of a later frame: to workers, to the master, bricks.
     pub(crate) bytes: [f64; 3],
@@ -65,7 +65,8 @@ pub(crate) struct Row {
     pub(crate) parts: [f64; 4],
     /// Processor time of the master a later frame, in ms: driver, streams, finisher.
     pub(crate) master_ms: [f64; 3],
-    /// Messages of a later frame: from the master, its writes (several may share one), to the master.
+    /// Messages of a later frame: from the master, its writes (several may share one), to the
+    /// master.
     pub(crate) messages: [f64; 3],
     /// Use of the threads while frames are steady; `None` where `throughput` is.
     pub(crate) steady: Option<Steady>,
@@ -96,9 +97,9 @@ pub(crate) const LOSSES: [(&str, &str); 7] = [
 /// Frames that a master has in flight.
 pub(crate) const IN_FLIGHT: u32 = FRAMES_IN_FLIGHT as u32;
 
-/// Least number of steady frames that throughput is measured over: three times those in flight. With
-/// fewer, chance decides: two of six frames came with an efficiency of 211 % on a disturbed machine,
-/// five of nine with 154 % on seven workers and 83 % on eight.
+/// Least number of steady frames that throughput is measured over: three times those in flight.
+/// With fewer, chance decides: two of six frames came with an efficiency of 211 % on a disturbed
+/// machine, five of nine with 154 % on seven workers and 83 % on eight.
 pub(crate) const LEAST_STEADY_FRAMES: usize = 3 * IN_FLIGHT as usize;
 
 /// The cluster to predict, apart from its number of workers.
@@ -152,8 +153,8 @@ pub(crate) fn simulate_observed(
     ran.map(|r| r.0).map_err(|e| Fail::failed(e.to_string()))
 }
 
-/// Predicts each number of workers, on `threads` threads of this machine. `messages` holds the costs
-/// of messages; those of decisions are measured for each number.
+/// Predicts each number of workers, on `threads` threads of this machine. `messages` holds the
+/// costs of messages; those of decisions are measured for each number.
 pub(crate) fn rows(
     jobs: &[FrameJob],
     trace: &Trace,

@@ -2,8 +2,8 @@
 //! messages of a cluster but hold each tile for its measured time instead of drawing it.
 //!
 //! This compares what the scheduler, gRPC and the system do with these tiles. All processes share
-//! the cores of this machine, and so they do in the simulation. Where messages alone fill the cores,
-//! the rehearsal no longer stands for a cluster; the table shows that as `busy`.
+//! the cores of this machine, and so they do in the simulation. Where messages alone fill the
+//! cores, the rehearsal no longer stands for a cluster; the table shows that as `busy`.
 
 use super::measure::FINISH;
 use super::predict::{self, Question};
@@ -356,8 +356,8 @@ async fn play(
             let Update::Frame(frame) = update else { continue };
             came.push(Instant::now());
             if came.len() == 1 {
-                // Measuring starts here: before the first frame the volume is cut into bricks, and all
-                // of them are sent.
+                // Measuring starts here: before the first frame the volume is cut into bricks, and
+                // all of them are sent.
                 for message in rest.by_ref() {
                     jobs.push_back(
                         client.submit(message).await.map_err(|e| remote::client_failure(&e))?,

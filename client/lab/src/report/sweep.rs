@@ -76,8 +76,8 @@ const COMBINED: ([f64; 4], [f64; 3], [Sums; 2], [u32; 2]) = (
     [1, 2],
 );
 
-/// Returns the settings that vary the knobs in `only` (all, if empty), the default first. Leaves out
-/// invalid settings (16 bits with a tent) and repeats.
+/// Returns the settings that vary the knobs in `only` (all, if empty), the default first. Leaves
+/// out invalid settings (16 bits with a tent) and repeats.
 pub(super) fn points(trial: &Trial, only: &[Group]) -> Vec<SweepPoint> {
     list(trial.base, trial.size(), trial.threads, trial.is_shaded(), only)
 }

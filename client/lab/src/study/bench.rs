@@ -1,4 +1,5 @@
-//! Runs the measurements of a study, in an order in which the finished parts stand alone after Ctrl-C.
+//! Runs the measurements of a study, in an order in which the finished parts stand alone after
+//! Ctrl-C.
 
 use super::paper::{self, NODES};
 use super::simulate::{MeasuredPath, Pace};

@@ -1,9 +1,9 @@
-//! Section 5.1 beyond its table: effects of the size of bricks, the radius of the kernel, the size of
-//! the picture, and culling.
+//! Section 5.1 beyond its table: effects of the size of bricks, the radius of the kernel, the size
+//! of the picture, and culling.
 //!
-//! The paper states these without numbers. Only bricks of 8 voxels can be drawn here. Bricks of 4 and
-//! 16 are *counted*: the voxels are put into boxes of that size, and the boxes are projected and
-//! culled against the measured occlusion behind each slab.
+//! The paper states these without numbers. Only bricks of 8 voxels can be drawn here. Bricks of 4
+//! and 16 are *counted*: the voxels are put into boxes of that size, and the boxes are projected
+//! and culled against the measured occlusion behind each slab.
 
 use super::nodes::{later, longest_wait, shares};
 use super::paper::{NODES, VOXEL_BYTES};
@@ -35,8 +35,8 @@ pub(super) struct Bricks {
     pub(super) needed_voxels: f64,
     /// Size of the needed voxels in MB at the paper's 16 bytes each.
     pub(super) needed_paper_mb: f64,
-    /// Voxels that macrotiles of 64 pixels read, for each voxel in a needed box. A box in several tiles
-    /// or slabs is read several times.
+    /// Voxels that macrotiles of 64 pixels read, for each voxel in a needed box. A box in several
+    /// tiles or slabs is read several times.
     pub(super) looked_at: f64,
     /// `looked_at` for macrotiles of 32 pixels.
     pub(super) looked_at_32: f64,

@@ -1,5 +1,5 @@
-//! Runs the paper's schedule for real: a master and workers of one thread each inside this process, as
-//! far as this machine has cores.
+//! Runs the paper's schedule for real: a master and workers of one thread each inside this process,
+//! as far as this machine has cores.
 //!
 //! The master has no core of its own: with as many workers as cores, it takes time from theirs.
 

@@ -4,10 +4,12 @@
 //!
 //! - [`bench`] runs all measurements in order: [`live`] on real clusters of this machine,
 //!   [`simulate`] on virtual ones.
-//! - [`order`] is Figure 1, [`nodes`] Figure 3 and Table 1, [`runs`] Figures 4, 5 and 7, [`effects`]
+//! - [`order`] is Figure 1, [`nodes`] Figure 3 and Table 1, [`runs`] Figures 4, 5 and 7,
+//!   [`effects`]
 //!   the effects that section 5.1 states without numbers.
 //! - [`paper`] has the numbers of the paper, [`verdict`] judges its sentences.
-//! - [`write`](mod@write) writes the files: [`tables`], [`charts`] (drawn by [`draw`]) and the [`page`]
+//! - [`write`](mod@write) writes the files: [`tables`], [`charts`] (drawn by [`draw`]) and the
+//!   [`page`]
 //!   with its [`parts`].
 
 mod bench;
@@ -40,9 +42,9 @@ use std::path::PathBuf;
 /// numbers, and judges which of its sentences hold.
 ///
 /// Every macrotile of the path is drawn and timed here, on one core. Clusters of at most as many
-/// workers as this machine has cores are run for real; the paper's 3 to 16 nodes are simulated by the
-/// scheduler itself with these times. Each figure says which it is. Ctrl-C ends the study and keeps
-/// the finished parts.
+/// workers as this machine has cores are run for real; the paper's 3 to 16 nodes are simulated by
+/// the scheduler itself with these times. Each figure says which it is. Ctrl-C ends the study and
+/// keeps the finished parts.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -64,7 +66,8 @@ pub struct StudyArgs {
     /// Replace the files of an earlier study
     #[arg(long)]
     force: bool,
-    /// Link of every simulated node: 1gbit, 10gbit, 100mbit or unlimited; the default is the paper's
+    /// Link of every simulated node: 1gbit, 10gbit, 100mbit or unlimited; the default is the
+    /// paper's
     #[arg(long, value_name = "RATE", default_value = paper::LINK, value_parser = parse::link)]
     link: parse::Rate,
     /// One-way latency between nodes

@@ -1,5 +1,5 @@
-//! Figure 3 and Table 1: how each rendering node spends its time, and the effect of smaller macrotiles,
-//! from the time spans of simulated frames.
+//! Figure 3 and Table 1: how each rendering node spends its time, and the effect of smaller
+//! macrotiles, from the time spans of simulated frames.
 
 use super::paper::{self, NODES};
 use super::simulate::{FrameReport, MeasuredPath, Pace, SimulatedCluster};
@@ -170,7 +170,8 @@ pub(super) struct Tiles {
     pub(super) tiles: f64,
 }
 
-/// Simulates Table 1: 15 rendering nodes, three slabs, tiles of 64 pixels, of 64 and then 32, of 32.
+/// Simulates Table 1: 15 rendering nodes, three slabs, tiles of 64 pixels, of 64 and then 32, of
+/// 32.
 pub(super) fn table_1(measured_path: &MeasuredPath) -> Result<Vec<Tiles>, Fail> {
     let workers = NODES[4] - 1;
     let cuts = [(Some(64), false), (Some(64), true), (Some(32), false)];

@@ -34,8 +34,8 @@ pub(super) struct Tiles {
     pub(super) edge: &'static str,
     pub(super) summed_s: f64,
     pub(super) max_wait_s: f64,
-    /// "Avg Rendering Time/Node". It is not the sum over 15 (1.11, 1.48, 1.86): with the longest wait
-    /// added to that it is (1.39, 1.69, 2.01).
+    /// "Avg Rendering Time/Node". It is not the sum over 15 (1.11, 1.48, 1.86): with the longest
+    /// wait added to that it is (1.39, 1.69, 2.01).
     pub(super) a_node_s: f64,
     /// The three as they are printed.
     #[serde(skip)]

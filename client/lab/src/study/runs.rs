@@ -1,5 +1,5 @@
-//! Figures 4, 5 and 7: times and bytes of frames by number of nodes, measured as far as this machine
-//! has cores and simulated beyond.
+//! Figures 4, 5 and 7: times and bytes of frames by number of nodes, measured as far as this
+//! machine has cores and simulated beyond.
 
 use super::nodes::later;
 use super::paper::{self, NODES, SLABS};

@@ -2,8 +2,8 @@
 //! links (`slabcast_sim`), with tiles that were drawn and timed here.
 //!
 //! There are two paces. *Here*: tiles take the time they took on this machine. *Paper*: tile times
-//! are multiplied so that one node takes 17 s for a frame, as in the paper (section 1). The ratio of
-//! tile times to links is then about that of 2000. The processor time of messages stays as it is
+//! are multiplied so that one node takes 17 s for a frame, as in the paper (section 1). The ratio
+//! of tile times to links is then about that of 2000. The processor time of messages stays as it is
 //! here.
 
 use super::paper;

@@ -1,4 +1,5 @@
-//! The tables of a study as CSV, one for each table and figure of the paper. Each line names its origin.
+//! The tables of a study as CSV, one for each table and figure of the paper. Each line names its
+//! origin.
 
 use super::Study;
 use super::paper;

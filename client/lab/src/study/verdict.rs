@@ -1,10 +1,10 @@
 //! Judges whether sentences of the paper hold in the study.
 //!
 //! Each sentence has a rule, the same for every volume, with a margin for other hardware and for a
-//! scheduler that sends each node only the bricks it lacks. A sentence about numbers of the head holds for another
-//! volume only by chance; it is judged all the same, and the page says which volume it was. Where a
-//! sentence says only that something is more, 3 % count as no difference: two times of one tile
-//! differ by as much.
+//! scheduler that sends each node only the bricks it lacks. A sentence about numbers of the head
+//! holds for another volume only by chance; it is judged all the same, and the page says which
+//! volume it was. Where a sentence says only that something is more, 3 % count as no difference:
+//! two times of one tile differ by as much.
 
 use super::Study;
 use super::nodes::Breakdown;

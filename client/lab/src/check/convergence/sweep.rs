@@ -99,8 +99,8 @@ pub(super) struct Floor {
 }
 
 impl Sweep {
-    /// The point at which linear compositing stops to gain: the thickest rung whose roundings are larger than
-    /// what thickness does, and the largest of them.
+    /// The point at which linear compositing stops to gain: the thickest rung whose roundings are
+    /// larger than what thickness does, and the largest of them.
     pub(super) fn floor(&self) -> Option<Floor> {
         let r = self.figures.iter().find(|r| r.linear_f64.rmse < rest(r))?;
         let mut all = [

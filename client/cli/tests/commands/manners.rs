@@ -1,6 +1,6 @@
 //! How the program behaves when all is well: what goes where, what is left, how it stops.
 
-use crate::program::{Process, end, master, names, run, signal, slabcast, text, wait_for_text};
+use crate::program::{Process, end, master, names, run, signal, slabcast, text, wait_until};
 use slabcast_common::stats::FrameStats;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -206,12 +206,14 @@ fn ctrl_c_keeps_whole_frames() {
 #[test]
 fn render_survives_sigstop_longer_than_worker_silence() {
     let dir = tempfile::tempdir().unwrap();
-    let (_master, address) = master(dir.path(), "formula:one", &["--record", "events.log"]);
-    let worker = ["worker", "--master", &address, "--threads", "1"];
+    let (_master, address) = master(dir.path(), "formula:one", &[]);
+    let name = "sleeper";
+    let worker = ["worker", "--master", &address, "--threads", "1", "--name", name];
     let worker = slabcast(dir.path(), &worker).stderr(Stdio::null()).spawn().unwrap();
     let worker = Process(worker);
-    let record = dir.path().join("events.log.part");
-    wait_for_text(&record, "\"joined\"");
+    let status = ["status", "--master", &address];
+    let is_there = || text(&run(dir.path(), &status).stdout).contains(name);
+    wait_until("the worker joined", is_there);
     let args = ["render", "formula:spheres:48", "--size", "160x160", "--frames", "40"];
     let args = [&args[..], &["--thickness", "0.25"]].concat();
     let mut child =
@@ -223,7 +225,8 @@ fn render_survives_sigstop_longer_than_worker_silence() {
     }
     signal(&child, "-STOP");
     worker.signal("-STOP");
-    wait_for_text(&record, "\"lost\"");
+    // The master drops a worker that is silent for 3 s.
+    wait_until("the master dropped the worker", || !is_there());
     signal(&child, "-CONT");
     let code = end(&mut child, Duration::from_secs(60));
     let mut said = String::new();

@@ -34,6 +34,15 @@ pub(crate) fn names(dir: &Path) -> Vec<String> {
     names
 }
 
+/// Waits until `done` returns true. Fails the test after a minute.
+pub(crate) fn wait_until(what: &str, done: impl Fn() -> bool) {
+    let until = Instant::now() + Duration::from_secs(60);
+    while !done() {
+        assert!(Instant::now() < until, "{what}: not within a minute");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
 /// Waits until a file contains `text`. Fails the test after a minute.
 pub(crate) fn wait_for_text(file: &Path, text: &str) {
     let until = Instant::now() + Duration::from_secs(60);

@@ -5,7 +5,7 @@
 //! exact of those before is taken. Rungs are measured when needed, and `cache` keeps the results.
 //!
 //! Targets are met with a margin, since the views and pixels between the judged ones may be worse.
-//! docs/accuracy.md says how often a target holds.
+//! docs/measurements/accuracy.md says how often a target holds.
 
 use super::cache::MeasurementCache;
 use super::cluster_bed::all_around;
@@ -61,9 +61,9 @@ pub struct Chosen {
 
 /// Returns the settings to try for pictures of `size` pixels, from fast to exact.
 ///
-/// Taken from the Pareto fronts of `slabcast lab report` (docs/accuracy.md): 16-bit sums with eps
-/// falling as sheets become thin, then 32-bit sums where 16 bits round too much. 16 bits are tried
-/// only where a sheet fits them.
+/// Taken from the Pareto fronts of `slabcast lab report` (docs/measurements/accuracy.md): 16-bit
+/// sums with eps falling as sheets become thin, then 32-bit sums where 16 bits round too much. 16
+/// bits are tried only where a sheet fits them.
 pub(super) fn ladder(base: &Setting, size: [u32; 2]) -> Vec<Setting> {
     let b = base.quality;
     let short = b.fits_i16();

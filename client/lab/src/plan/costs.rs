@@ -26,16 +26,16 @@ use std::time::Instant;
 const KNOWN_PINGS: Pings =
     Pings { alone_ns: [22_400, 40_100, 35_500], company_ns: [2_000, 7_600, 7_000] };
 /// gRPC's share of a message's time without waking; the rest is the socket's. On that machine 0.8
-/// us (TRANSPORT.md, answer 1) of 3.65 us a message at either end.
+/// us (docs/design/transport.md, answer 1) of 3.65 us a message at either end.
 const GRPC_SHARE: f64 = 0.22;
 /// Share of the driver's time for a ping that is the message and not a decision. In a rehearsal
 /// (mri256 at 1024x1024, four workers, that machine) 15 % of 1.85 ms a frame were neither decisions
 /// nor waking: 0.8 us for each of 333 messages.
 const DRIVER_MESSAGE_SHARE: f64 = 0.8;
-/// Time of a byte of a message, in ns: 4.4 us for 16 KiB without waking (TRANSPORT.md).
+/// Time of a byte of a message, in ns: 4.4 us for 16 KiB without waking (docs/design/transport.md).
 const BYTE_NS: f64 = 0.3;
 /// Time to send a pixel of three bytes to the client and to receive it, in ns: 14 and 17 us for
-/// 64 KiB (TRANSPORT.md, answer 1).
+/// 64 KiB (docs/design/transport.md, answer 1).
 const DELIVER_PIXEL_NS: [f64; 2] = [0.65, 0.8];
 
 /// Fixed costs of a message whatever its content, in ns.
@@ -153,7 +153,8 @@ pub(super) fn messages(trace: &Trace, schedule: Schedule) -> Costs {
             call_ns: price.call,
             send: each(byte(worker_send, &result_bytes)),
             receive: each(byte(worker_receive, &lease_bytes)),
-            // Decoding bricks into the cache takes some 3 ns a byte (docs/performance.md).
+            // Decoding bricks into the cache takes some 3 ns a byte
+            // (docs/measurements/performance.md).
             bricks: each(BYTE_NS + 3.0),
         },
         pack_byte_ns: trace.about.packing.pack_ns,

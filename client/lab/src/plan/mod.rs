@@ -34,7 +34,8 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// Share of a link's nominal rate that is left for payload after the headers of Ethernet, IP, TCP
-/// and HTTP/2. 118 MB/s were measured on an emulated link of 1 Gbit/s (TRANSPORT.md, answer 7).
+/// and HTTP/2. 118 MB/s were measured on an emulated link of 1 Gbit/s (docs/design/transport.md,
+/// answer 7).
 pub(crate) const GOODPUT: f64 = 0.94;
 
 /// Predicts frame times of a cluster before it is there.
@@ -90,8 +91,8 @@ pub struct PlanArgs {
           help_heading = "Measuring")]
     rehearse: Option<parse::Workers>,
     /// Address at which the rehearsal's master listens, open to anyone who reaches it: one that
-    /// workers reach over a link of --link's rate, such as docs/shaped.sh makes [default:
-    /// 127.0.0.1, unlimited]
+    /// workers reach over a link of --link's rate, such as docs/measurements/scripts/shaped.sh
+    /// makes [default: 127.0.0.1, unlimited]
     #[arg(long, value_name = "ADDRESS", requires = "rehearse", help_heading = "Measuring")]
     rehearse_at: Option<IpAddr>,
     /// Command that starts the rehearsal's workers, such as `ip netns exec far`; this program and

@@ -139,7 +139,7 @@ pub struct OutputArgs {
     #[arg(long, value_name = "FORMAT", hide_possible_values = true, value_enum)]
     pub format: Option<Format>,
     /// Frames a second of a moving picture
-    #[arg(long, value_name = "N", default_value = "12",
+    #[arg(long, value_name = "N", default_value = "12", hide_short_help = true,
           value_parser = clap::value_parser!(u16).range(1..=240))]
     pub fps: u16,
     /// Also all frames, small, on one PNG

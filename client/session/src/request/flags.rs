@@ -37,7 +37,7 @@ pub struct AxisArgs {
     /// World axis that faces the eye at azimuth 0 [default: +y]
     ///
     /// +z where up lies along y; -y of a CT whose file has no anatomical axes, as slices are stored.
-    #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true, hide_short_help = true)]
     pub front: Option<Axis>,
 }
 
@@ -159,7 +159,7 @@ pub struct QualityArgs {
     ///
     /// 0 shuts no pixel.
     #[arg(long, value_name = "E", default_value = "1/512", value_parser = parse::fraction,
-          allow_negative_numbers = true)]
+          allow_negative_numbers = true, hide_short_help = true)]
     eps: f64,
     /// Reconstruction kernel: gaussian, bspline or tent
     ///

@@ -194,7 +194,8 @@ async fn split_tiles_of_a_sole_frame_cost_no_pixel() {
 #[tokio::test]
 async fn work_stealing_while_a_tile_is_drawn_costs_no_pixel() {
     let dir = tempfile::tempdir().expect("a folder");
-    let views = ["--size", "300x280", "--frames", "1", "--thickness", "0.125", "--tile", "256"];
+    // Larger tiles than of 64 pixels are split beforehand, not stolen from.
+    let views = ["--size", "62x60", "--frames", "1", "--thickness", "0.015625", "--tile", "64"];
     let render = |name: &str, how: &[&str]| {
         let out = dir.path().join(name);
         run(Command::new(SLABCAST).arg("render").args(how).args(views).arg("-o").arg(&out));

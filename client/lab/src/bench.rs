@@ -28,7 +28,7 @@ use std::time::Instant;
 /// The time of a frame runs from camera set to picture in memory. The first view warms up and is
 /// left out. The error is that of the middle view, measured as by `slabcast lab error`.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
+#[command(after_long_help = "\
 Examples:
   slabcast lab bench brain.nii.gz --threads 1
   slabcast lab bench brain.nii.gz --tf peer-semi --size 1024x1024 --projection persp --json")]

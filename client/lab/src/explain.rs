@@ -30,7 +30,7 @@ use std::fmt::Write;
 /// its arithmetic: they lead to the pixel of the picture to the bit. Below stand the pixel, the
 /// pixel of f64 sheets, and the limit of infinitely thin sheets.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
+#[command(after_long_help = "\
 Examples:
   slabcast lab explain brain.nii.gz --tf fog
   slabcast lab explain brain.nii.gz --pixel 256,200

@@ -12,7 +12,7 @@ use std::path::PathBuf;
 /// Exit code 0 if all decisions are the same, 1 if one differs or the file is broken; the message
 /// names the line.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
+#[command(after_long_help = "\
 Examples:
   slabcast master --volume brain.nii.gz --record events.log
   slabcast render brain.nii.gz --workers 4 --record events.log

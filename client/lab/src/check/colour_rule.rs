@@ -31,7 +31,7 @@ use std::time::Instant;
 /// 1/255; the paper's rule has a limit of its own too. Popping is the RMSE between frames whose
 /// sheets lie half a sheet apart.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
+#[command(after_long_help = "\
 Examples:
   slabcast lab check colour-rule brain.nii.gz
   slabcast lab check colour-rule head.nrrd --up=-y --tf peer-opaque --azimuth 20 --times

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 /// Prints `NAME SHA256` lines of frames of the sample and of formula volumes, or compares them
 /// with those of a file.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
+#[command(after_long_help = "\
 Examples:
   slabcast lab check golden --verify tests/golden.txt
   slabcast lab check golden > tests/golden.txt      (raise PIXELS_VERSION and say why in CHANGELOG.md)")]

@@ -31,7 +31,7 @@ const SCHEDULES: [Schedule; 2] = [Schedule::Slab, Schedule::Region];
 /// threads (1, 2), culling (on, off) and links (embedded, TCP, TCP to workers of 32 KiB) with those
 /// of the serial renderer.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
+#[command(after_long_help = "\
 Examples:
   slabcast lab check matrix --pairwise
   slabcast lab check matrix brain.nii.gz")]

@@ -36,7 +36,7 @@ use slabcast_session::fail::Fail;
 #[derive(clap::Args, Clone, Debug)]
 #[command(
     args_conflicts_with_subcommands = true,
-    after_help = "\
+    after_long_help = "\
 Examples:
   slabcast lab check                            every case of the table: two minutes
   slabcast lab check --group extreme --long     one group, with its long cases

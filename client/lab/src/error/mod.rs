@@ -47,7 +47,7 @@ const MODEL_TOLERANCE: f64 = 1e-5;
 /// the whole Gaussian, neither cut at the radius nor lowered by its edge value) and ripple (the
 /// limit of a field in which a constant comes back constant).
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
+#[command(after_long_help = "\
 Examples:
   slabcast lab error brain.nii.gz
   slabcast lab error brain.nii.gz --tf peer-semi --thickness 0.5 --azimuth 30

@@ -46,7 +46,7 @@ pub(crate) const GOODPUT: f64 = 0.94;
 /// runs with these times against virtual workers and links. The table separates measured from
 /// predicted.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
+#[command(after_long_help = "\
 Examples:
   slabcast lab plan brain.nii.gz --workers 1..64 --link 1gbit
   slabcast lab plan ct.nrrd --tf bone --size 1024x1024 --workers 8,16,32 --link 10gbit --threads 16 -o plan/
@@ -76,7 +76,7 @@ pub struct PlanArgs {
           help_heading = "Cluster")]
     latency: u64,
     /// Times each tile is drawn; the shortest time counts
-    #[arg(long, value_name = "N", default_value = "3", help_heading = "Measuring",
+    #[arg(long, value_name = "N", default_value = "3", hide_short_help = true, help_heading = "Measuring",
           value_parser = clap::value_parser!(u32).range(1..=100))]
     repeats: u32,
     /// Use the message costs of a known machine instead of measuring them
@@ -93,11 +93,23 @@ pub struct PlanArgs {
     /// Address at which the rehearsal's master listens, open to anyone who reaches it: one that
     /// workers reach over a link of --link's rate, such as docs/measurements/scripts/shaped.sh
     /// makes [default: 127.0.0.1, unlimited]
-    #[arg(long, value_name = "ADDRESS", requires = "rehearse", help_heading = "Measuring")]
+    #[arg(
+        long,
+        value_name = "ADDRESS",
+        requires = "rehearse",
+        hide_short_help = true,
+        help_heading = "Measuring"
+    )]
     rehearse_at: Option<IpAddr>,
     /// Command that starts the rehearsal's workers, such as `ip netns exec far`; this program and
     /// its arguments are appended
-    #[arg(long, value_name = "COMMAND", requires = "rehearse_at", help_heading = "Measuring")]
+    #[arg(
+        long,
+        value_name = "COMMAND",
+        requires = "rehearse_at",
+        hide_short_help = true,
+        help_heading = "Measuring"
+    )]
     rehearse_by: Option<String>,
     /// Folder for plan.svg, plan.png, plan.json and plan.csv
     #[arg(short = 'o', long = "output", value_name = "DIR", help_heading = "Output")]

@@ -30,7 +30,7 @@ use sweep::{Group, Knob, SweepPoint};
 /// in memory, over several views, on one thread and on all; other work on the machine lengthens
 /// them. Ctrl-C ends the sweep and keeps the settings measured so far.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
+#[command(after_long_help = "\
 Examples:
   slabcast lab report brain.nii.gz
   slabcast lab report head.nrrd --up=-y --tf peer-opaque -o report/

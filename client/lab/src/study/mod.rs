@@ -46,7 +46,7 @@ use std::path::PathBuf;
 /// the scheduler itself with these times. Each figure says which it is. Ctrl-C ends the study and
 /// keeps the finished parts.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
+#[command(after_long_help = "\
 Examples:
   slabcast lab study head.nrrd --up=-y --tf peer-opaque -o study/
   slabcast lab study ct.nrrd --tf bone --quick

@@ -32,7 +32,7 @@ use sweep::{Deviation, Sweep, SweepScene};
 /// from the line before. Nothing is shut. A turn is seen in both projections, whatever
 /// --projection says.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
+#[command(after_long_help = "\
 Examples:
   slabcast lab check convergence
   slabcast lab check convergence brain.nii.gz --tf brain --azimuth 30 --size 256x256

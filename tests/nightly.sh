@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
-# The long campaigns, for nights: bash tests/nightly.sh [mutants|simd|faults|matrix]...
+# The long campaigns, for nights: bash tests/nightly.sh [mutants|simd|faults|matrix|long]...
 #
 #   mutants   100,000 mutants of small files through every parser (SLABCAST_MUTANTS)
 #   simd      the renderer's tests on every instruction set of this machine
 #   faults    10,000 seeds of faults in the virtual cluster (SLABCAST_SEEDS)
 #   matrix    every combination of workers, threads, tiles, slabs, culling and links
+#   long      tests of commands that take half a minute and more
 #
 # Prints one line for each campaign: its name, ok or FAILED, seconds, and its figure. What each
 # campaign printed is in target/nightly. Ends with 1 if one failed.
@@ -27,7 +28,7 @@ campaign() { # campaign NAME FIGURE COMMAND...: FIGURE is an awk program over th
 # Sums the tests of all test programs.
 tests='/^test result:/ { passed += $4; failed += $6 } END { printf "%d tests passed, %d failed", passed, failed }'
 
-[ $# -gt 0 ] || set -- mutants simd faults matrix
+[ $# -gt 0 ] || set -- mutants simd faults matrix long
 for name in "$@"; do
     case $name in
     mutants)
@@ -64,8 +65,12 @@ for name in "$@"; do
         campaign matrix '/^exact: / { line = $0 } END { print line }' \
             cargo run --release --locked -- lab check matrix
         ;;
+    long)
+        campaign long "$tests" \
+            cargo test --locked -p slabcast --test commands -- --ignored error_target thin_sheets
+        ;;
     *)
-        echo "nightly: no campaign $name; there are mutants, simd, faults and matrix" >&2
+        echo "nightly: no campaign $name; there are mutants, simd, faults, matrix and long" >&2
         exit 2
         ;;
     esac

@@ -145,6 +145,7 @@ fn magnified_picture_is_rerendered_byte_by_byte() {
 
 /// The volume is at the master: errors are found by comparing its pictures.
 #[test]
+#[ignore = "takes half a minute; tests/nightly.sh runs it"]
 fn error_target_is_kept_on_a_cluster() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();

@@ -53,6 +53,7 @@ fn thin_sheets_converge_on_the_sample_volume() {
 
 /// Volumes that are kept beside the repository; without them this says that it looked at nothing.
 #[test]
+#[ignore = "takes half a minute; tests/nightly.sh runs it"]
 fn thin_sheets_converge_on_measured_volumes() {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
     for (name, look) in [

@@ -39,7 +39,7 @@ pub struct Profile {
 
 impl Profile {
     /// Returns the profile of `kernel` with deviation `std` and `radius` in vox: those of
-    /// [`Quality::kernel_shape`] times the length of a lattice step.
+    /// `Quality::kernel_shape` times the length of a lattice step.
     pub fn new(kernel: Kernel, std: f64, radius: f64) -> Self {
         match kernel {
             Kernel::Gaussian => Profile::gaussian(std, radius),

@@ -1,6 +1,6 @@
 //! The `slabcast` program: what is typed, which command that is, and how it ended.
 //!
-//! [`command`] lists the subcommands; each has a file of its own, but for those of the laboratory
+//! [`mod@command`] lists the subcommands; each has a file of its own, but for those of the laboratory
 //! ([`lab`], crate `slabcast_lab`). [`config`] lays flags, environment and file over each other,
 //! [`usage`] says what is wrong with a command line, [`logging`] begins to log. What renders a request
 //! is in `slabcast_session`.

@@ -1,5 +1,5 @@
 //! `slabcast lab explain`: explains the colour of a pixel sheet by sheet, or the savings of a scene
-//! ([`crate::ablation`]).
+//! (`crate::ablation`).
 //!
 //! The numbers are the renderer's own ([`slabcast_render::oracle::explain`]): they lead to the
 //! pixel of the picture, to the bit. Each line has the transmittance of f64 sheets for comparison,

@@ -5,7 +5,7 @@
 //! - [`error`] measures the error of one picture against the limit of thin sheets.
 //! - [`explain`] shows how the samples along one pixel's ray add up to its colour.
 //! - [`check`] compares pictures with the oracle over every way to render them.
-//! - [`bench`] times the renderer on one scene.
+//! - [`mod@bench`] times the renderer on one scene.
 //! - [`report`] sweeps the quality settings and reports error against time.
 //! - [`plan`] predicts the frame times of a cluster that does not exist yet.
 //! - [`study`] repeats the evaluation of the paper.

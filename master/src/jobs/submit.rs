@@ -1,7 +1,7 @@
 //! From a request to a job: everything that is checked and computed before its first frame.
 //!
 //! A path may have 100,000 views. Working them out takes longer than the driver may be away from
-//! its heartbeats, so [`Plan::new`] runs on a thread of the caller's runtime
+//! its heartbeats, so `Plan::new` runs on a thread of the caller's runtime
 //! ([`crate::Handle::submit`]) and the driver gets the finished plan.
 
 use super::active::ActiveJob;

@@ -21,7 +21,7 @@
 //! Each kind of view has its geometry ([`crate::geometry`]): `general` for every view and every
 //! kind of sums; far faster, for whole-number sums, `ortho` for most orthographic views, `sheared`
 //! for those whose kernel leans, `perspective` for most perspective views, and `shared_rows` for
-//! views with a level camera. [`Part::draw`] picks the fastest that takes the view.
+//! views with a level camera. `Part::draw` picks the fastest that takes the view.
 
 use crate::geometry::general::{GeneralScratch, Kind, Queues, RenderGeneral};
 use crate::geometry::open_sheets::Store;

@@ -1,6 +1,6 @@
 //! `slabcast lab check`: tests of the shipped program against its promises.
 //!
-//! Without a subcommand: a [`table`] of cases, each with an error, its bound and a verdict. Pixels
+//! Without a subcommand: a `table` of cases, each with an error, its bound and a verdict. Pixels
 //! must not depend on who rendered them: `matrix` renders views over every way to divide and carry
 //! the work and compares their hashes with the serial renderer's; `golden` prints hashes that are
 //! equal on every machine and build; `convergence` measures how fast pictures converge with thinner

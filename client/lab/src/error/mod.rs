@@ -9,7 +9,7 @@
 //! the limit and an ideal. They are errors of the model, no part of the sum, and depend on the
 //! kernel only.
 //!
-//! [`report`] prints the result as text or JSON, [`map`] draws it.
+//! `report` prints the result as text or JSON, `map` draws it.
 
 mod map;
 mod report;

@@ -1,7 +1,7 @@
 //! `slabcast lab report`: error against run time, as a table, a chart and files for programs.
 //!
-//! [`sweep`] lists the settings to draw, [`crate::autotune`] measures them, [`chart`] draws the
-//! results and [`write`](mod@write) writes the files.
+//! `sweep` lists the settings to draw, [`crate::autotune`] measures them, `chart` draws the
+//! results and `write` writes the files.
 
 mod chart;
 mod sweep;

@@ -103,7 +103,7 @@ impl Bench<'_> {
         let most = NODES.iter().map(|n| n - 1).chain(self.live.iter().copied());
         let wanted = most.chain([paper::FIGURE_1_WORKERS]);
         let path = MeasureArgs {
-            scenes: scenes,
+            scenes,
             frames: views,
             work: request.work,
             wanted: wanted.map(|n| (TILES_A_NODE * f64::from(n)).ceil() as u64).collect(),

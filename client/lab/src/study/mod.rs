@@ -2,15 +2,15 @@
 //!
 //! Every figure keeps measured and simulated results apart.
 //!
-//! - [`bench`] runs all measurements in order: [`live`] on real clusters of this machine,
-//!   [`simulate`] on virtual ones.
-//! - [`order`] is Figure 1, [`nodes`] Figure 3 and Table 1, [`runs`] Figures 4, 5 and 7,
-//!   [`effects`]
+//! - [`bench`] runs all measurements in order: `live` on real clusters of this machine,
+//!   `simulate` on virtual ones.
+//! - `order` is Figure 1, `nodes` Figure 3 and Table 1, `runs` Figures 4, 5 and 7,
+//!   `effects`
 //!   the effects that section 5.1 states without numbers.
-//! - [`paper`] has the numbers of the paper, [`verdict`] judges its sentences.
-//! - [`write`](mod@write) writes the files: [`tables`], [`charts`] (drawn by [`draw`]) and the
-//!   [`page`]
-//!   with its [`parts`].
+//! - `paper` has the numbers of the paper, `verdict` judges its sentences.
+//! - `write` writes the files: `tables`, `charts` (drawn by `draw`) and the
+//!   `page`
+//!   with its `parts`.
 
 mod bench;
 mod charts;

@@ -156,7 +156,7 @@ pub struct Kept {
 pub enum Packing<'a> {
     /// With a window of the part and where weights across and down lie.
     Window(&'a [Phases; 2]),
-    /// With their [places](Splat::aside_of).
+    /// With their places.
     Aside,
     /// With their tier and a [place](Shape::place) in it, and where weights across lie.
     Tier(&'a Phases, Shape, &'a TierOf),

@@ -1,7 +1,7 @@
 //! Bricks of a part that may arrive while it is drawn.
 //!
 //! A part that runs through all sheets asks, sheet by sheet, for the bricks that begin there and
-//! may touch an open pixel ([`ArrivingBricks::is_supplied`]). Where one is missing the part stops,
+//! may touch an open pixel (`ArrivingBricks::is_supplied`). Where one is missing the part stops,
 //! with a list of what it lacks.
 
 use crate::scene::{Corner, Frame};

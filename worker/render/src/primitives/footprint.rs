@@ -198,11 +198,11 @@ impl Sections {
 #[derive(Clone, Copy, Debug)]
 #[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))] // Some of it is read in lanes alone.
 pub struct Slant<'a> {
-    /// [`Leaning::subpixels`](Leaning::subpixels).
+    /// `Leaning::subpixels`.
     pub subpixels: [&'a [i32]; 2],
     /// Where weights across and down lie.
     pub(crate) phases: [Phases; 2],
-    /// [`Leaning::row`](Leaning::row): less than 2^20 either way.
+    /// `Leaning::row`: less than 2^20 either way.
     pub row: i32,
     /// Whether sections or rows have columns of their own.
     pub skewed: bool,

@@ -1,7 +1,7 @@
 //! Parts of any view in any kind of sums: the general path ([`crate::tile`] says what it does).
 //!
 //! Each section of a voxel has a footprint of its own, and sheets lie one after the other in
-//! [`Planes`]. Voxels wait as brick and index, so that float sums can be sorted into their one
+//! `Planes`. Voxels wait as brick and index, so that float sums can be sorted into their one
 //! order.
 
 mod planes;

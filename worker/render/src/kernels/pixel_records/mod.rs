@@ -3,7 +3,7 @@
 //!
 //! A record has N sheets, four or eight: as many as a voxel has sections, which for sheets of a vox
 //! are four. Four sheets of 16-bit sums are 32 bytes: one operation of AVX2, and one of AVX-512 for
-//! two pixels ([`short`]); 32-bit sums take twice that ([`long`]). NEON's registers have sixteen
+//! two pixels (`short`); 32-bit sums take twice that (`long`). NEON's registers have sixteen
 //! bytes, and all kinds of sums share their loops there (`neon`). Every loop is written plainly
 //! here; the loops in lanes must equal it.
 
@@ -249,7 +249,7 @@ pub trait Recorded: Accumulate {
     type Depth: Copy + Default;
     /// Extinction and colours of a voxel.
     type Payload: Copy + Default;
-    /// Whether sections that [lie aside of each other](slant) are added in lanes.
+    /// Whether sections that lie aside of each other are added in lanes.
     const SLANTED: bool = false;
     /// Windows begin at a column that is a multiple of it, and have as many: records of `N` sheets
     /// that may share a register.

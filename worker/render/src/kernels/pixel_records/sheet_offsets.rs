@@ -234,7 +234,7 @@ pub struct Layers<'a, S: Recorded, const N: usize> {
     /// Whether a voxel has the same columns in all of them, with the same weights.
     pub alike: bool,
     /// How sections lie aside of each other, if where they are is looked up as voxels are added
-    /// ([`slant`](super::slant)).
+    /// (shear).
     pub slant: Option<Slant<'a>>,
 }
 
@@ -337,7 +337,7 @@ pub(crate) fn along_row(row: i64, [x, y_of]: [i32; 2], y: i32) -> i32 {
     x + Lean::along_row(row, i64::from(middle - y_of)) as i32
 }
 
-/// [`splat_apart`] of voxels whose rows lie aside of each other, too: each row has weights of its
+/// `splat_apart` of voxels whose rows lie aside of each other, too: each row has weights of its
 /// own. `phases`: where those across lie in each slot.
 #[inline(always)]
 pub fn splat_skewed<S: Recorded, const N: usize>(

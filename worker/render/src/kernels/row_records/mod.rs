@@ -165,7 +165,7 @@ pub struct Ends<'a, S: Recorded> {
     pub before: &'a mut [S::Pixel],
     /// Pixels that `before` is of: elsewhere there is nothing, whatever it says.
     pub was: &'a mut [u64; EDGE],
-    /// As [`crate::tile::Pixels`] has them.
+    /// As `crate::tile::Pixels` has them.
     pub pixels: &'a [[u32; 4]],
 }
 
@@ -302,7 +302,7 @@ fn firsts_of(columns: u64, n: usize) -> u64 {
 /// Sums whose tiers are added to and folded in lanes.
 pub trait Tiered: Recorded {
     /// Adds `voxels` with `payloads`, which begin at the sheet that `slot` holds, to the tiers that
-    /// their [rows](Splat::first) name.
+    /// their rows name.
     fn add_flat<const N: usize>(
         simd: Simd,
         tiers: &mut Tiers<'_, Self, N>,
@@ -322,7 +322,7 @@ pub trait Tiered: Recorded {
 
     /// Makes the sums that a sheet and the one behind have in pixels of the tiers above them: in
     /// those that are open and have any extinction in the sheet, in rows from `rows` on, until
-    /// there are [`ENOUGH`]. Says where to go on.
+    /// there are `ENOUGH`. Says where to go on.
     ///
     /// # Panics
     /// If there are fewer sums or pixels than a part has.

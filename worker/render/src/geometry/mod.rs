@@ -8,7 +8,7 @@
 //! | [`shared_rows`] | level camera: layers of the lattice are rows of the picture | whole numbers |
 //! | [`general`] | all | all |
 //!
-//! Each fast path says which views it accepts](ortho::accepts); [`crate::tile` takes the first
+//! Each fast path says which views it accepts (`ortho::accepts`); `crate::tile` takes the first
 //! that does. [`open_sheets`] and [`batch`] are shared by the fast ones.
 
 pub mod batch;

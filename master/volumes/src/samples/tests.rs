@@ -29,7 +29,7 @@ impl Read for Panics {
 #[test]
 fn panic_in_the_decompressing_thread_fails_the_file() {
     let need = 4 * THREAD_MIN_BYTES;
-    let layout = Layout::new([need, 1, 1], Number::U8, Endian::Little, "sizes").unwrap();
+    let layout = Layout::new([1024, need / 1024, 1], Number::U8, Endian::Little, "sizes").unwrap();
     let supply = Supply::Encoded { name: "gzip", bytes: need, ratio: 64 };
     let error = read(&mut Panics(need as usize / 2), supply, &layout).expect_err("it panics");
     assert_eq!((error.kind, &error.field[..]), (OpenErrorKind::Unsupported, "data"));

@@ -312,8 +312,8 @@ async fn lookahead_grows_while_render_threads_wait_for_bricks() {
         let asked = bricks_of(world.hear().await);
         // Its thread is idle for more than a fiftieth of the time since the scene began.
         let stalled = Instant::now();
-        while stalled.elapsed() < Duration::from_millis(2)
-            || stalled.elapsed() * 25 < scene_began.elapsed()
+        while stalled.elapsed() < Duration::from_millis(10)
+            || stalled.elapsed() * 5 < scene_began.elapsed()
         {
             world.settle().await;
         }

@@ -21,7 +21,7 @@
 //! let view = View::new(&volume.lattice, &camera, size, &quality).expect("a valid camera");
 //! let frame = Frame::new(Scene::new(&selftest::spec(&volume, quality)).into(), view);
 //!
-//! let (picture, mut scratch) = (Rect::of_size(size), tile::Scratch::default());
+//! let (picture, mut scratch) = (Rect::from_size(size), tile::Scratch::default());
 //! let (all, blank) = (SheetRange::new(-20, 20), tile::blank(picture));
 //! let (pixels, voxels) =
 //!     tile::render(&frame, Simd::detect(), picture, all, &bricks, &blank, &mut scratch);

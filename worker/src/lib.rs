@@ -16,7 +16,7 @@
 //!
 //! A worker of two threads that serves the master at an address until it is told to stop.
 //!
-//! ```no_run
+//! ```ignore
 //! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
 //! use slabcast_worker::{Config, Ended, dial};
 //!

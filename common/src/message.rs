@@ -1,4 +1,4 @@
-//! What master and worker say to each other, as values.
+//! Messages between master and worker, as values.
 //!
 //! This is the seam of the system: a TCP link encodes these at `slabcast_proto::convert`, an
 //! embedded link passes them as they are, and neither side can tell. Bricks travel beside

@@ -1,4 +1,4 @@
-//! What `status`, `jobs` and `cancel` share: a question to a running master, and tables of answers.
+//! Client calls of `status`, `jobs` and `cancel` to a running master, and the tables they print.
 
 use slabcast_client::{Client, ClientError, Job, JobState};
 use slabcast_session::fail::Fail;

@@ -1,4 +1,4 @@
-//! What becomes of a command line that is not understood: one line that says what to do.
+//! Usage errors: a command line that can't be parsed gets one line with the remedy.
 
 use crate::command::command;
 use clap::error::ErrorKind;

@@ -1,4 +1,5 @@
-//! What renders a request anywhere: what the command and its laboratory share.
+//! Rendering sessions, shared by the command and its laboratory: a request is rendered by an embedded
+//! cluster or by a remote master, and its pictures are written.
 //!
 //! - [`request`] turns flags and files into a request; [`volume`] opens its volume, [`transfer`] its
 //!   colours and opacities, [`parse`] single values.

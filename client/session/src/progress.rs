@@ -1,4 +1,4 @@
-//! What a person sees while frames are rendered, on stderr alone.
+//! Progress display on stderr while frames are rendered.
 //!
 //! On a terminal: one bar that moves with the macrotiles of the frame at hand. Elsewhere: a
 //! line now and then, so that a log of a long run stays short.
@@ -57,7 +57,7 @@ pub fn note(line: &str) {
 /// State of a run, for its progress bar.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Step {
-    /// What the run waits for; empty while frames are rendered.
+    /// Reason the run waits, for people ("no workers"); empty while frames are rendered.
     pub waiting: String,
     /// Number of frames that are done.
     pub frames: u64,

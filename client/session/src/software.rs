@@ -1,4 +1,4 @@
-//! What files say of the program that wrote them.
+//! Name and version of this program, as output files carry them.
 
 use std::io::Error;
 

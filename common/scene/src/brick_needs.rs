@@ -1,4 +1,4 @@
-//! What the bricks of a job must hold: which voxels, and what of each.
+//! Contents that a job needs in its bricks: which voxels, and whether normals and gradients.
 //!
 //! Bricks are kept from job to job and from worker to worker, so a set of them has a key that says
 //! what is in it. A set serves every job that needs no more.

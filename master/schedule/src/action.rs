@@ -1,4 +1,4 @@
-//! What the scheduler asks its driver to do, and what it tells about itself.
+//! Actions: the scheduler's outputs, which its driver carries out; and views of its state.
 
 use crate::{Micros, Spans};
 use slabcast_common::brick::BrickSetKey;

@@ -1,4 +1,4 @@
-//! What happens to the scheduler: the closed list of its inputs.
+//! Events: the closed list of the scheduler's inputs.
 
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};

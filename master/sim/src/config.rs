@@ -1,4 +1,4 @@
-//! What a virtual cluster is made of: links, costs, the master and its workers.
+//! Configuration of a virtual cluster: links, costs, the master and its workers.
 
 use crate::Nanos;
 use slabcast_common::link::FRAMES_IN_FLIGHT;

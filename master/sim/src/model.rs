@@ -1,4 +1,4 @@
-//! What tiles cost and what their results hold: the part of a simulation that knows pictures.
+//! Tile models, the costs of tiles and the contents of their results: the part of a simulation that knows pictures.
 
 use crate::Unpredictable;
 use slabcast_common::image::TilePixels;

@@ -1,4 +1,4 @@
-//! What a run leaves: pictures in a folder, one picture, a moving one, or video in a pipe.
+//! Output of a run: pictures in a folder, one picture, a moving one, or video in a pipe.
 //!
 //! [`Output`] is where and as what, checked before any work; [`Writer`] takes the frames as they
 //! come and encodes them on threads of its own beside rendering. `mod@file` keeps the promise that

@@ -320,7 +320,7 @@ impl VolumeSceneArgs {
 pub struct OpenedVolume {
     /// The volume with its voxels.
     pub volume: Volume,
-    /// Its lattice and values, with its digest.
+    /// Lattice, value range and SHA-256 digest of the opened volume.
     pub info: VolumeInfo,
     /// Axes that are up and front, flags and defaults resolved.
     pub orientation: Orientation,

@@ -1,4 +1,4 @@
-//! What a frame cost: its statistics, its critical path and its spans for a trace.
+//! Accounting of a frame: its statistics, its critical path and its spans for a trace.
 
 pub(crate) mod critical_path;
 pub(crate) mod ledger;

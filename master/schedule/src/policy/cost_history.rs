@@ -1,4 +1,4 @@
-//! What earlier frames teach about a picture: the rendering time, the owner and the bricks of each
+//! Costs known from earlier frames of a picture: the rendering time, the owner and the bricks of each
 //! leaf of 16x16 pixels, and how fast each worker is.
 //!
 //! Consecutive frames of a path are cut differently: a tile of 64 pixels in one is four of 32 in

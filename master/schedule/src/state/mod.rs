@@ -1,4 +1,4 @@
-//! What the scheduler knows: frames in the making, leases, workers, and which worker holds which
+//! State of the scheduler: frames in the making, leases, workers, and which worker holds which
 //! brick.
 
 pub(crate) mod cluster;

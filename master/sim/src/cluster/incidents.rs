@@ -1,4 +1,4 @@
-//! What goes wrong, arranged or at random: deaths, partitions, lies.
+//! Incidents, scripted or at random: deaths, partitions, lies.
 
 use super::{HeldBricks, VirtualCluster};
 use crate::config::WorkerProfile;

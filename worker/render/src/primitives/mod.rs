@@ -1,4 +1,4 @@
-//! What kernels and geometries work with: tables of weights, integer positions, lattice rows, fixed
+//! Tables and positions that kernels and geometries share: tables of weights, integer positions, lattice rows, fixed
 //! sizes.
 //!
 //! Imports nothing of this crate but itself.

@@ -1,4 +1,4 @@
-//! What can be seen: pixels that are still open, bricks that lie over them, and the depths at which
+//! Visibility: pixels that are still open, bricks that lie over them, and the depths at which
 //! the previous frame was shut.
 
 #[doc(hidden)]

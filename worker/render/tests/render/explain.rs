@@ -1,4 +1,4 @@
-//! What `explain` says is what the renderer did.
+//! `explain` reports the numbers that the renderer used.
 
 use crate::support::{bricks_of, transfer};
 use glam::DVec3;

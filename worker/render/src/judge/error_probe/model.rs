@@ -1,4 +1,4 @@
-//! What the model itself and rounded positions cost, at a few of a tile's pixels.
+//! Error of the model itself and of rounded positions, at a few of a tile's pixels.
 //!
 //! Eight pixels of each block that [`estimate`](crate::judge::error_probe) draws again are worked
 //! out point by point along their rays, as the limit is, but coarsely: the field of kernels is

@@ -191,6 +191,11 @@ where
         self.line(&(0..=48).map(turn).collect::<Vec<_>>(), 1.8, colour)
     }
 
+    /// Draws the left and the lower edge of the area of a plot.
+    pub(crate) fn axes(&self, plot: &Box2, ink: RGBColor) -> Result<(), Failed> {
+        self.line(&[(plot.x0, plot.y0), (plot.x0, plot.y1), (plot.x1, plot.y1)], 1.2, ink)
+    }
+
     /// Draws a line of text with its base line at `y`.
     pub(crate) fn text(
         &self,

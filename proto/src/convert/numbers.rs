@@ -4,7 +4,7 @@ use super::WireError;
 use glam::{DMat3, DVec3};
 use slabcast_common::brick::{BRICK_EDGE, MAX_BRICKS};
 use slabcast_common::view::MAX_EDGE;
-use slabcast_common::volume::{Lattice, SampleKind, ValueSummary};
+use slabcast_common::volume::{Lattice, SampleKind, ValueMap, ValueSummary};
 
 /// Exactly three finite numbers.
 pub(super) fn triple_from_wire(field: &str, numbers: &[f64]) -> Result<[f64; 3], WireError> {
@@ -70,8 +70,40 @@ pub(super) fn check_lattice(lattice: &Lattice, dims: &str, fields: &str) -> Resu
     lattice.check().map_err(|problem| WireError::value(fields, problem))
 }
 
+/// Fields that say what values a volume has; the messages of both packages have them by these names.
+pub(super) struct SummaryFields {
+    pub(super) value_scale: Option<f64>,
+    pub(super) value_offset: Option<f64>,
+    pub(super) min_code: Option<f64>,
+    pub(super) max_code: Option<f64>,
+    pub(super) histogram: Vec<u64>,
+    pub(super) nan_samples: u64,
+    pub(super) infinite_samples: u64,
+}
+
+/// Reads the values of a volume whose samples are of `kind`.
+pub(super) fn summary_from_fields(
+    kind: SampleKind,
+    fields: SummaryFields,
+) -> Result<ValueSummary, WireError> {
+    let summary = ValueSummary {
+        kind,
+        map: ValueMap {
+            scale: finite("value_scale", fields.value_scale.unwrap_or(1.0))?,
+            offset: finite("value_offset", fields.value_offset.unwrap_or(0.0))?,
+        },
+        min_code: finite("min_code", fields.min_code.unwrap_or(0.0))?,
+        max_code: finite("max_code", fields.max_code.unwrap_or(0.0))?,
+        histogram: fields.histogram,
+        nan: fields.nan_samples,
+        infinite: fields.infinite_samples,
+    };
+    check_summary(&summary)?;
+    Ok(summary)
+}
+
 /// Checks the values of a volume.
-pub(super) fn check_summary(summary: &ValueSummary) -> Result<(), WireError> {
+fn check_summary(summary: &ValueSummary) -> Result<(), WireError> {
     if summary.histogram.len() != 256 {
         return Err(WireError::length("histogram", summary.histogram.len(), 256));
     }

@@ -115,15 +115,7 @@ impl Draw for Chart<'_> {
             on.line(&[(at, PLOT_AREA.y0), (at, PLOT_AREA.y1)], 1.0, theme.grid)?;
             on.text(&n.to_string(), (at, PLOT_AREA.y1 + 20.0), 12.0, Anchor::Middle, theme.ink)?;
         }
-        on.line(
-            &[
-                (PLOT_AREA.x0, PLOT_AREA.y0),
-                (PLOT_AREA.x0, PLOT_AREA.y1),
-                (PLOT_AREA.x1, PLOT_AREA.y1),
-            ],
-            1.2,
-            theme.ink,
-        )?;
+        on.axes(&PLOT_AREA, theme.ink)?;
         let middle = ((PLOT_AREA.x0 + PLOT_AREA.x1) / 2.0, (PLOT_AREA.y0 + PLOT_AREA.y1) / 2.0);
         on.text("workers", (middle.0, PLOT_AREA.y1 + 38.0), 13.0, Anchor::Middle, theme.ink)?;
         on.upwards("of what so many cores could do", (22.0, middle.1), 13.0, theme.ink)?;

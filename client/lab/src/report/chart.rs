@@ -80,15 +80,7 @@ impl Draw for Chart<'_> {
             on.line(&[(PLOT_AREA.x0, py), (PLOT_AREA.x1, py)], 1.0, theme.grid)?;
             on.text(&tick(t), (PLOT_AREA.x0 - 8.0, py + 4.0), 12.0, Anchor::Right, theme.ink)?;
         }
-        on.line(
-            &[
-                (PLOT_AREA.x0, PLOT_AREA.y0),
-                (PLOT_AREA.x0, PLOT_AREA.y1),
-                (PLOT_AREA.x1, PLOT_AREA.y1),
-            ],
-            1.2,
-            theme.ink,
-        )?;
+        on.axes(&PLOT_AREA, theme.ink)?;
         let middle = ((PLOT_AREA.x0 + PLOT_AREA.x1) / 2.0, (PLOT_AREA.y0 + PLOT_AREA.y1) / 2.0);
         on.text(
             "ms a frame (median), less is better",

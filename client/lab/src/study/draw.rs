@@ -218,15 +218,7 @@ impl Draw for Plot {
             on.line(&[(PLOT_AREA.x0, py(t)), (PLOT_AREA.x1, py(t))], 1.0, theme.grid)?;
             on.text(&number(t), (PLOT_AREA.x0 - 8.0, py(t) + 4.0), 12.0, Anchor::Right, theme.ink)?;
         }
-        on.line(
-            &[
-                (PLOT_AREA.x0, PLOT_AREA.y0),
-                (PLOT_AREA.x0, PLOT_AREA.y1),
-                (PLOT_AREA.x1, PLOT_AREA.y1),
-            ],
-            1.2,
-            theme.ink,
-        )?;
+        on.axes(&PLOT_AREA, theme.ink)?;
         let middle = ((PLOT_AREA.x0 + PLOT_AREA.x1) / 2.0, (PLOT_AREA.y0 + PLOT_AREA.y1) / 2.0);
         on.text(&self.x.0, (middle.0, PLOT_AREA.y1 + 44.0), 13.0, Anchor::Middle, theme.ink)?;
         on.upwards(&self.y.0, (20.0, middle.1), 13.0, theme.ink)?;

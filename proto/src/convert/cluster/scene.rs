@@ -7,7 +7,7 @@ use super::shared::{
 use super::{digest_from_wire, required, wire};
 use crate::convert::WireError;
 use crate::convert::numbers::{
-    check_lattice, check_summary, finite, matrix_from_wire, positive, size_from_wire,
+    SummaryFields, check_lattice, matrix_from_wire, positive, size_from_wire, summary_from_fields,
     triple_from_wire, vector_from_wire,
 };
 use bytes::Bytes;
@@ -18,7 +18,7 @@ use slabcast_common::kernel::Lean;
 use slabcast_common::message::{SceneSpec, ToWorker};
 use slabcast_common::quality::Sums;
 use slabcast_common::view::{Projection, View};
-use slabcast_common::volume::{Lattice, ValueMap, ValueSummary, VolumeInfo};
+use slabcast_common::volume::{Lattice, VolumeInfo};
 
 fn volume_to_wire(info: &VolumeInfo) -> wire::Volume {
     let (l, s) = (&info.lattice, &info.summary);
@@ -49,19 +49,16 @@ fn volume_from_wire(info: wire::Volume) -> Result<VolumeInfo, WireError> {
         origin: vector_from_wire("origin", &info.origin)?,
     };
     check_lattice(&lattice, "dims", "dims, steps, origin")?;
-    let summary = ValueSummary {
-        kind: kind_from_wire("kind", info.kind)?,
-        map: ValueMap {
-            scale: finite("value_scale", info.value_scale.unwrap_or(1.0))?,
-            offset: finite("value_offset", info.value_offset.unwrap_or(0.0))?,
-        },
-        min_code: finite("min_code", info.min_code.unwrap_or(0.0))?,
-        max_code: finite("max_code", info.max_code.unwrap_or(0.0))?,
+    let fields = SummaryFields {
+        value_scale: info.value_scale,
+        value_offset: info.value_offset,
+        min_code: info.min_code,
+        max_code: info.max_code,
         histogram: info.histogram,
-        nan: info.nan_samples,
-        infinite: info.infinite_samples,
+        nan_samples: info.nan_samples,
+        infinite_samples: info.infinite_samples,
     };
-    check_summary(&summary)?;
+    let summary = summary_from_fields(kind_from_wire("kind", info.kind)?, fields)?;
     Ok(VolumeInfo { digest: digest_from_wire("digest", &info.digest)?, lattice, summary })
 }
 

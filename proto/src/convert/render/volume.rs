@@ -2,12 +2,12 @@
 
 use super::shared::{kind_from_wire, kind_to_wire, vec3_from_wire, vec3_to_wire};
 use super::{axis_from_wire, axis_to_wire, wire};
-use crate::convert::numbers::{check_lattice, check_summary, finite};
+use crate::convert::numbers::{SummaryFields, check_lattice, summary_from_fields};
 use crate::convert::{MAX_REASON, WireError, digest_from_wire, required};
 use crate::model::VolumeDescription;
 use bytes::Bytes;
 use glam::DVec3;
-use slabcast_common::volume::{Lattice, ValueMap, ValueSummary, VolumeInfo};
+use slabcast_common::volume::{Lattice, VolumeInfo};
 use slabcast_scene::path::Orientation;
 
 /// Writes the volume of a master.
@@ -89,18 +89,15 @@ fn info_from_wire(info: wire::Volume) -> Result<VolumeInfo, WireError> {
         origin: vec3("origin", info.origin)?,
     };
     check_lattice(&lattice, "samples", "samples, step_i, step_j, step_k, origin")?;
-    let summary = ValueSummary {
-        kind: kind_from_wire("sample_kind", info.sample_kind)?,
-        map: ValueMap {
-            scale: finite("value_scale", info.value_scale.unwrap_or(1.0))?,
-            offset: finite("value_offset", info.value_offset.unwrap_or(0.0))?,
-        },
-        min_code: finite("min_code", info.min_code.unwrap_or(0.0))?,
-        max_code: finite("max_code", info.max_code.unwrap_or(0.0))?,
+    let fields = SummaryFields {
+        value_scale: info.value_scale,
+        value_offset: info.value_offset,
+        min_code: info.min_code,
+        max_code: info.max_code,
         histogram: info.histogram,
-        nan: info.nan_samples,
-        infinite: info.infinite_samples,
+        nan_samples: info.nan_samples,
+        infinite_samples: info.infinite_samples,
     };
-    check_summary(&summary)?;
+    let summary = summary_from_fields(kind_from_wire("sample_kind", info.sample_kind)?, fields)?;
     Ok(VolumeInfo { digest: digest_from_wire("digest", &info.digest)?, lattice, summary })
 }

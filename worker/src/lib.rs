@@ -16,8 +16,9 @@
 //!
 //! A worker of two threads that serves the master at an address until it is told to stop.
 //!
-//! ```ignore
-//! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
+//! ```
+//! # #[tokio::main]
+//! # async fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! use slabcast_worker::{Config, Ended, dial};
 //!
 //! let config = Config {
@@ -29,7 +30,7 @@
 //!     machine: String::new(),
 //! };
 //! let (stop, stopped) = tokio::sync::watch::channel(false);
-//! let worker = tokio::spawn(dial::run(config, "master.lan:9140".into(), stopped));
+//! let worker = tokio::spawn(dial::run(config, "127.0.0.1:7433".into(), stopped));
 //! stop.send(true)?;
 //! assert_eq!(worker.await??, Ended::Stopped);
 //! # Ok(())

@@ -1,6 +1,6 @@
 //! Image-aligned sheet-based splatting with occlusion culling (paper section 3), on one tile.
 //!
-//! ```no_run
+//! ```
 //! use glam::DVec3;
 //! use slabcast_common::image::FrameState;
 //! use slabcast_common::occlusion::Rect;

@@ -15,7 +15,7 @@ pub struct Blocks {
     places: Vec<u32>,
 }
 
-/// A block: neighbouring bricks.
+/// A block: neighbouring bricks, which a query looks at together before it looks at each.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Block {
     /// Box around the bricks' tight boxes, in index coordinates.
@@ -57,7 +57,7 @@ impl Blocks {
         Blocks::default()
     }
 
-    /// Returns the blocks.
+    /// Returns all blocks, each with its box and its number of voxels.
     pub fn all(&self) -> &[Block] {
         &self.all
     }

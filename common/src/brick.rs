@@ -10,7 +10,7 @@ use crate::volume::{Digest32, SampleKind, Samples};
 
 /// Edge of a brick in voxels (the paper's choice, section 4.2).
 pub const BRICK_EDGE: u32 = 8;
-/// Voxels of a full brick.
+/// Number of voxels of a full brick: [`BRICK_EDGE`] cubed.
 pub const BRICK_VOXELS: usize = 512;
 /// Most bricks that a volume may have: a 4096^3 volume has 2^27.
 pub const MAX_BRICKS: u64 = 1 << 27;
@@ -18,7 +18,7 @@ pub const MAX_BRICKS: u64 = 1 << 27;
 /// How a volume is cut into bricks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BrickGrid {
-    /// Bricks along each index axis.
+    /// Number of bricks along each index axis (i, j, k).
     pub dims: [u32; 3],
 }
 
@@ -55,9 +55,9 @@ impl BrickGrid {
 /// Box of a brick's relevant voxels, in index coordinates of the volume, ends included.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TightBox {
-    /// Smallest index along each axis.
+    /// Smallest voxel index along each index axis (i, j, k).
     pub lo: [u32; 3],
-    /// Largest index along each axis.
+    /// Largest voxel index along each index axis (i, j, k); part of the box.
     pub hi: [u32; 3],
 }
 
@@ -80,9 +80,9 @@ impl TightBox {
 /// Directory entry of a relevant brick: what the scheduler knows without its voxels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BrickInfo {
-    /// The brick.
+    /// Number of the brick within its volume.
     pub id: BrickId,
-    /// Box of its relevant voxels.
+    /// Smallest box around the brick's relevant voxels, in index coordinates of the volume.
     pub tight: TightBox,
     /// Number of relevant voxels, 1 to 512.
     pub voxels: u16,
@@ -102,7 +102,7 @@ pub struct Brick {
     pub id: BrickId,
     /// Local index `x + 8 y + 64 z` of each voxel, ascending.
     pub index: Vec<u16>,
-    /// Code of each voxel.
+    /// Sample code of each voxel, in the order of `index`.
     pub values: Samples,
     /// Octahedral normal code of each voxel ([`crate::shade`]); `None` in unshaded scenes.
     pub normals: Option<Vec<u16>>,

@@ -24,11 +24,11 @@ use glam::{DMat3, DVec3};
 /// Profile of the kernel along one axis. Lengths in vox.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Profile {
-    /// Kind of kernel.
+    /// Shape of the profile: Gaussian, linear or another kernel.
     pub kernel: Kernel,
-    /// Standard deviation in vox.
+    /// Standard deviation of the profile in vox.
     pub std: f64,
-    /// Support radius in vox.
+    /// Support radius in vox: the profile is zero beyond it.
     pub radius: f64,
     /// Length of a lattice step along this axis in vox: weights are multiplied by it before they
     /// become 16-bit fixed point.
@@ -227,7 +227,8 @@ impl Lean {
     /// No shear, as in cubic lattices.
     pub const NONE: Lean = Lean { depth: [0.0; 2], row: 0.0 };
 
-    /// Returns the slopes of x over depth, y over depth, and x over y.
+    /// Returns the three slopes x over depth, y over depth and x over y, all unitless (vox per
+    /// vox).
     pub fn to_array(&self) -> [f64; 3] {
         let [x, y] = self.depth;
         [x, y, self.row]
@@ -256,8 +257,8 @@ impl Lean {
         DMat3::from_cols(i, j, k)
     }
 
-    /// Returns the slopes over depth of a parallel ray, in coordinates in which the kernel is not
-    /// sheared.
+    /// Returns the slopes x and y over depth (unitless, vox per vox) of a parallel ray, in
+    /// coordinates in which the kernel is not sheared.
     pub fn ray_slopes(&self) -> [f64; 2] {
         let ray = self.upright(DVec3::Z);
         [ray.x, ray.y]

@@ -12,10 +12,11 @@ pub const ROUND_F32: f32 = 12_582_912.0;
 /// ln 2 in two parts. The first has 15 trailing zero bits, so its products with small integers are
 /// exact (Cody and Waite).
 pub const LN2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
-/// Coefficients of (exp(x) - 1) / x, highest power first.
+/// Taylor coefficients of `(exp(x) - 1) / x`, highest power first; unitless.
 pub const TAYLOR: [f32; 7] =
     [1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0];
-/// Coefficients of the series of [`phi`] over the square of the depth, highest power first.
+/// Taylor coefficients of `phi(tau) / tau^2` (see [`phi`]) in powers of tau, highest power first;
+/// unitless.
 pub const PHI: [f32; 5] = [-1.0 / 2016.0, 1.0 / 360.0, -1.0 / 80.0, 1.0 / 24.0, -1.0 / 12.0];
 
 /// Evaluates a polynomial by Horner's rule, highest power first.
@@ -44,7 +45,7 @@ fn exp_parts(x: f32) -> (f32, f32) {
     (f32::from_bits(((exponent + 127) as u32) << 23), p * r)
 }
 
-/// Returns `exp(x)` for `x <= 0`, clamped below at -87. Relative error at most 2 ulp.
+/// Returns `exp(x)`, 0 to 1, for `x <= 0`; x is clamped below at -87. Relative error at most 2 ulp.
 #[inline(always)]
 pub fn exp_neg(x: f32) -> f32 {
     let (s, q) = exp_parts(x);

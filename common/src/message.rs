@@ -35,7 +35,7 @@ pub struct SceneSpec {
 /// One macrotile of one slab, leased to one worker (paper section 4.3; `slab` schedule).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lease {
-    /// The leased task.
+    /// Id of the leased task.
     pub task: TaskId,
     /// Attempt at the task; a result counts only while its epoch is live.
     pub epoch: Epoch,
@@ -43,7 +43,7 @@ pub struct Lease {
     pub frame: FrameId,
     /// The macrotile, in pixels of the picture.
     pub tile: Rect,
-    /// Sheets of the slab.
+    /// Sheets of the slab that the task draws.
     pub slab: SheetRange,
     /// Bricks that the task needs, ascending. The worker holds each or has it under way; it starts
     /// when the last has arrived.
@@ -56,7 +56,7 @@ pub struct Lease {
 /// requests the bricks that it turns out to need.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RegionLease {
-    /// The leased task.
+    /// Id of the leased task.
     pub task: TaskId,
     /// Attempt at the task; a result counts only while its epoch is live.
     pub epoch: Epoch,
@@ -67,7 +67,7 @@ pub struct RegionLease {
     /// Whether some pixels are also drawn in thinner sheets, to estimate the error of the
     /// thickness.
     pub estimate: bool,
-    /// What another worker has drawn of the tile; `None` if the region starts from nothing.
+    /// Progress that another worker made on the tile; `None` if the region starts from nothing.
     pub begun: Option<Arc<Checkpoint>>,
 }
 
@@ -103,14 +103,14 @@ impl Checkpoint {
 pub struct RegionSplit {
     /// The task whose lease was split.
     pub task: TaskId,
-    /// Attempt at the task.
+    /// Number of the attempt at the task whose lease was split.
     pub epoch: Epoch,
     /// Piece of the tile that the worker keeps, in pixels of the picture. Its result has exactly
     /// these pixels.
     pub kept: Rect,
     /// Piece that the worker gives away: the rest of the tile.
     pub given: Rect,
-    /// Progress of the given piece.
+    /// State of the given piece at the sheet border where it was split: a worker goes on from here.
     pub begun: Checkpoint,
 }
 
@@ -219,11 +219,11 @@ pub enum ToWorker {
 pub struct Hello {
     /// Protocol versions that the worker speaks.
     pub protocol_versions: ProtocolVersions,
-    /// The worker's [`PIXELS_VERSION`](crate::PIXELS_VERSION).
+    /// [`PIXELS_VERSION`](crate::PIXELS_VERSION) of the worker's program.
     pub pixels_version: u32,
     /// Name for people (host and process).
     pub name: String,
-    /// Number of render threads.
+    /// Number of the worker's render threads.
     pub threads: u32,
     /// Bytes of bricks that the worker may hold.
     pub memory_budget_bytes: u64,
@@ -245,7 +245,7 @@ pub struct Hello {
 pub struct Counters {
     /// Voxels put into a sheet's bucket.
     pub tossed: u64,
-    /// Voxels drawn.
+    /// Number of voxels drawn into sheets.
     pub splatted: u64,
     /// Voxels dropped as hidden, with their brick or alone.
     pub culled: u64,
@@ -262,19 +262,20 @@ impl std::ops::AddAssign for Counters {
 /// Times of a task in microseconds on the worker's own clock.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct TaskTimes {
-    /// Arrival of the lease.
+    /// Time at which the lease arrived, in microseconds on the worker's clock.
     pub received_us: u64,
-    /// Arrival of the last brick that the task needed.
+    /// Time at which the last brick that the task needed arrived, in microseconds on the worker's
+    /// clock.
     pub ready_us: u64,
-    /// Start of rendering.
+    /// Time at which rendering began, in microseconds on the worker's clock.
     pub start_us: u64,
-    /// End of rendering.
+    /// Time at which rendering ended, in microseconds on the worker's clock.
     pub end_us: u64,
-    /// Number of the render thread.
+    /// Index of the render thread that drew the task, from 0.
     pub thread: u32,
 }
 
-/// What a region cost beside drawing: bricks, stalls, idle threads.
+/// Cost of a region beside drawing: bricks, stalls, idle threads.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RegionCost {
     /// Bricks that the region was drawn from, as places in the directory, ascending.
@@ -298,7 +299,7 @@ pub struct ErrorsBySource {
     pub thickness: SampledError,
     /// Change under exact instead of rounded positions.
     pub positions: SampledError,
-    /// Change under an untruncated kernel.
+    /// Change of the pixels under a kernel whose tails are not cut off.
     pub truncation: SampledError,
     /// Change under a kernel without ripple.
     pub ripple: SampledError,
@@ -317,7 +318,7 @@ impl ErrorsBySource {
         ErrorsBySource { thickness, positions, truncation, ripple }
     }
 
-    /// Adds another tile's samples.
+    /// Adds the samples of another tile, source by source.
     pub fn add(&mut self, other: ErrorsBySource) {
         self.thickness.add(other.thickness);
         self.positions.add(other.positions);
@@ -349,7 +350,7 @@ impl SampledError {
         }
     }
 
-    /// Adds another tile's samples, saturating.
+    /// Adds the samples of another tile; sums saturate.
     pub fn add(&mut self, other: SampledError) {
         self.pixels = self.pixels.saturating_add(other.pixels);
         self.squares = self.squares.saturating_add(other.squares);
@@ -363,7 +364,7 @@ impl SampledError {
     }
 }
 
-/// Pixels of a finished task.
+/// Pixels of a finished task: sums that the master encodes, or encoded pixels.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Pixels {
     /// Opacity and fixed-point colour, which the master encodes.
@@ -387,18 +388,18 @@ impl Pixels {
     }
 }
 
-/// Result of a rendered task.
+/// Result that a worker sends for a finished task.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TileResult {
-    /// The task.
+    /// Id of the task that was leased.
     pub task: TaskId,
-    /// Attempt at the task.
+    /// Number of the attempt at the task; the result counts only while this epoch is live.
     pub epoch: Epoch,
-    /// The tile's pixels.
+    /// Pixels of the task's tile.
     pub pixels: Pixels,
     /// Size of the message in bytes; `None` if it crossed no network.
     pub bytes: Option<u32>,
-    /// Voxel counts.
+    /// Numbers of voxels that the task tossed, drew and culled.
     pub counters: Counters,
     /// Times. For a region, `start_us` to `end_us` is drawing alone, without stalls.
     pub times: TaskTimes,
@@ -471,10 +472,10 @@ pub enum ToMaster {
 /// Bricks of one set on their way to one worker.
 #[derive(Clone, Debug)]
 pub struct BrickBatch {
-    /// The set.
+    /// Brick set that the bricks belong to.
     pub set: BrickSetKey,
-    /// Bricks that arrived whole.
+    /// Bricks that arrived whole, ready for use.
     pub bricks: Vec<Arc<Brick>>,
-    /// Bricks that failed their checksum.
+    /// Ids of bricks that failed their checksum.
     pub broken: Vec<BrickId>,
 }

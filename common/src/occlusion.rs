@@ -10,13 +10,13 @@
     Clone, Copy, Debug, Default, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize,
 )]
 pub struct Rect {
-    /// Left column.
+    /// Left column in pixels; inside the rectangle.
     pub x0: i32,
-    /// Top row.
+    /// Top row in pixels; inside the rectangle.
     pub y0: i32,
-    /// One past the right column.
+    /// Column in pixels just right of the rectangle.
     pub x1: i32,
-    /// One past the bottom row.
+    /// Row in pixels just below the rectangle.
     pub y1: i32,
 }
 
@@ -41,7 +41,7 @@ impl Rect {
         (self.y1 - self.y0).max(0) as usize
     }
 
-    /// Returns the number of pixels.
+    /// Returns the number of pixels in the rectangle.
     pub fn area(&self) -> usize {
         self.width() * self.height()
     }
@@ -116,7 +116,7 @@ impl ShutMap {
         self.shut[i]
     }
 
-    /// Recounts after pixels were shut.
+    /// Brings the summed-area counts up to date after [`ShutMap::shut`].
     pub fn refresh(&mut self) {
         if !self.stale {
             return;

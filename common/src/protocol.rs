@@ -17,7 +17,7 @@ pub const MAX_THREADS: u32 = 4096;
 /// Versions of a protocol that a program speaks: from `oldest` to `newest`, both included.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ProtocolVersions {
-    /// The oldest version.
+    /// Oldest protocol version that is spoken.
     pub oldest: u32,
     /// The newest version; not below the oldest.
     pub newest: u32,

@@ -4,7 +4,7 @@
 use crate::spelling::nearest;
 use serde::{Deserialize, Serialize};
 
-/// Reconstruction kernel.
+/// Reconstruction kernel: the function that a voxel stands for (paper section 3).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Kernel {
@@ -65,15 +65,15 @@ pub struct Quality {
     /// Termination threshold: a pixel whose transmittance `1 - A` is below it is shut. 0 shuts
     /// nothing; at most 0.5.
     pub eps: f64,
-    /// Reconstruction kernel.
+    /// Reconstruction kernel: the function that a voxel stands for.
     pub kernel: Kernel,
     /// Standard deviation of the Gaussian in lattice steps, 0.4 to 1; other kernels have one width.
     pub std: f64,
     /// Support radius of the Gaussian in lattice steps, 1 to 3; other kernels have one radius.
     pub radius: f64,
-    /// Compositing rule.
+    /// Rule by which sheets become opacity: extinction as here, or the paper's.
     pub compositing: Compositing,
-    /// How sections reach their sheet.
+    /// Way in which the sections of a voxel reach their sheets.
     pub splat: Splat,
     /// Number type of the sums; `Auto` until the master has decided.
     pub sums: Sums,
@@ -113,7 +113,7 @@ impl Default for Quality {
 pub struct InvalidField {
     /// Flag or JSON field as the user wrote it (`thickness`, `views[3].eye`).
     pub field: String,
-    /// What is wrong with the value, and what to do.
+    /// Problem with the value and its remedy, one line for people.
     pub problem: String,
 }
 
@@ -205,7 +205,7 @@ impl Quality {
     }
 }
 
-/// Which schedule the master runs. Never changes a byte.
+/// Schedule that the master runs. The pixels are the same to the byte under each.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Schedule {
@@ -217,7 +217,8 @@ pub enum Schedule {
     Slab,
 }
 
-/// Where the slabs of the `slab` schedule end. Never changes a byte.
+/// Rule for the ends of the slabs of the `slab` schedule. The pixels are the same to the byte under
+/// each.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Borders {
@@ -253,11 +254,11 @@ pub struct Work {
     pub tiles_per_worker: f64,
     /// Edge of all macrotiles in pixels (16, 32, 64, 128 or 256); `None` lets the quadtree choose.
     pub tile: Option<u32>,
-    /// Schedule.
+    /// Schedule that the master runs: by region or by slab.
     pub schedule: Schedule,
     /// Data kept although the scene does not need them.
     pub keep: Keep,
-    /// Where slabs end.
+    /// Rule for the ends of slabs, under the `slab` schedule.
     pub borders: Borders,
     /// Whether one pixel in 128 is also drawn in thinner sheets, for the statistics' estimate of
     /// the error of the thickness (`region` schedule).

@@ -43,7 +43,7 @@ pub fn decode_normal(code: u16) -> Vec3 {
     Vec3::new(x * scale, y * scale, z * scale)
 }
 
-/// Where light comes from.
+/// Direction that light comes from.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Light {
@@ -53,7 +53,7 @@ pub enum Light {
     Direction([f64; 3]),
 }
 
-/// The word `head` in JSON.
+/// The word `head`, which stands for a head light in JSON.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum HeadWord {
     /// `"head"`
@@ -67,15 +67,15 @@ pub enum HeadWord {
 pub struct Shading {
     /// Whether voxels are shaded at all; if not, no normals are needed.
     pub on: bool,
-    /// Ambient factor, 0 to 10.
+    /// Share of ambient light in the base colour, 0 to 10; unitless.
     pub ambient: f64,
-    /// Diffuse factor, 0 to 10.
+    /// Share of diffuse (Lambert) light in the base colour, 0 to 10; unitless.
     pub diffuse: f64,
-    /// Specular factor, 0 to 10.
+    /// Share of specular (Blinn-Phong) light, added in white, 0 to 10; unitless.
     pub specular: f64,
-    /// Specular exponent, 0 to 10000.
+    /// Exponent of the specular light, 0 to 10000; unitless.
     pub power: f64,
-    /// Where light comes from.
+    /// Direction of the light: from the eye, or fixed in the world.
     pub light: Light,
 }
 
@@ -160,7 +160,7 @@ impl Power {
     }
 }
 
-/// Shading ready for use.
+/// Shading made ready for many voxels: f32 factors, a unit light direction, the specular power.
 #[derive(Clone, Debug)]
 pub struct Shader {
     ambient: f32,
@@ -172,7 +172,7 @@ pub struct Shader {
 }
 
 impl Shader {
-    /// Makes `shading` ready.
+    /// Builds a shader from `shading`, whose values must be valid.
     pub fn new(shading: &Shading) -> Self {
         let light = match shading.light {
             Light::Head(_) => None,
@@ -259,14 +259,15 @@ impl Shader {
 /// Light on a voxel: a factor of its base colour, and white that is added.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LightTerms {
-    /// Factor of the base colour: ambient and diffuse light.
+    /// Unitless factor of the base colour: ambient and diffuse light.
     pub lambert: f32,
-    /// Specular light, added in white.
+    /// Specular light added to each component in linear light; 1 = white.
     pub gloss: f32,
 }
 
 impl LightTerms {
-    /// Returns one component of the shaded colour, in `[0, 1]`, from that of the base colour.
+    /// Returns one component of the shaded linear colour, 0 to 1, given that component of the base
+    /// colour.
     #[inline(always)]
     pub fn apply(self, base: f32) -> f32 {
         (base * self.lambert + self.gloss).clamp(0.0, 1.0)

@@ -9,14 +9,14 @@ use serde::{Deserialize, Serialize};
 /// A half-open run of sheets `[first, end)`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct SheetRange {
-    /// Number of the first sheet.
+    /// Number of the first sheet in the run.
     pub first: i32,
     /// Number one past the last sheet.
     pub end: i32,
 }
 
 impl SheetRange {
-    /// Returns the run `[first, end)`.
+    /// Returns the run of sheets from `first` up to but without `end`.
     pub fn new(first: i32, end: i32) -> Self {
         SheetRange { first, end }
     }

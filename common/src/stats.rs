@@ -7,22 +7,23 @@ use serde::{Deserialize, Serialize};
 /// Milliseconds of a frame by cause, as the master saw it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct FrameMs {
-    /// From the frame's start to its last pixel.
+    /// Milliseconds from the frame's start to its last pixel.
     pub total: f64,
-    /// Projecting and culling bricks, quadtrees, queues.
+    /// Milliseconds that the master spent on projecting and culling bricks, quadtrees and queues.
     pub cull: f64,
-    /// Time during which bricks were on their way to at least one worker.
+    /// Milliseconds during which bricks were on their way to at least one worker.
     pub distribute: f64,
-    /// Sum of the workers' render times.
+    /// Milliseconds of rendering, summed over the render threads of all workers.
     pub render: f64,
-    /// Time to take results into the picture.
+    /// Milliseconds that the master spent on taking results into the picture.
     pub composite: f64,
-    /// Sum of the workers' waiting at slab barriers, per render thread.
+    /// Milliseconds of waiting at slab barriers, summed over the render threads of all workers.
     pub wait: f64,
-    /// Time during which bricks were on their way while some worker rendered.
+    /// Milliseconds during which bricks were on their way while some worker rendered.
     #[serde(default)]
     pub overlap: f64,
-    /// Sum of the workers' `stall_ms`.
+    /// Milliseconds of render threads that had nothing to draw while a region lacked bricks, summed
+    /// over all workers.
     #[serde(default)]
     pub stall: f64,
 }
@@ -30,33 +31,35 @@ pub struct FrameMs {
 /// One worker's part in a frame. Times are in milliseconds.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct WorkerStats {
-    /// The worker's name.
+    /// Name of the worker, for people.
     pub id: String,
-    /// Time that its render threads rendered.
+    /// Milliseconds of rendering, summed over the worker's render threads.
     pub render_ms: f64,
-    /// Time during which bricks were on their way to it.
+    /// Milliseconds during which bricks were on their way to the worker.
     pub distribute_ms: f64,
-    /// Time that leases and results were on their way or in queues.
+    /// Milliseconds that leases and results of the worker were on their way or in queues.
     pub p2p_ms: f64,
-    /// Time of its render threads without a task, of this frame or another, while the frame lasted.
+    /// Milliseconds of the worker's render threads without a task, of this frame or another, while
+    /// the frame lasted.
     pub wait_ms: f64,
-    /// How often a region stalled for lack of bricks.
+    /// Number of times that a region stalled on this worker for lack of bricks.
     #[serde(default)]
     pub stalls: u64,
-    /// Time that regions were stalled, summed; render threads drew others meanwhile if there were
-    /// any.
+    /// Milliseconds that regions were stalled, summed; render threads drew others meanwhile if
+    /// there were any.
     #[serde(default)]
     pub parked_ms: f64,
-    /// Time of its render threads with nothing to draw while some region was stalled.
+    /// Milliseconds of the worker's render threads with nothing to draw while some region was
+    /// stalled.
     #[serde(default)]
     pub stall_ms: f64,
-    /// Bricks of this scene's set that it holds at the frame's end.
+    /// Number of bricks of this scene's set that the worker holds at the frame's end.
     pub bricks_held: u64,
-    /// Encoded bytes of the bricks it holds.
+    /// Encoded bytes of the bricks that the worker holds at the frame's end.
     pub bytes_held: u64,
-    /// Bricks sent to it for this frame.
+    /// Number of bricks sent to the worker for this frame.
     pub bricks_sent: u64,
-    /// Encoded bytes of the bricks sent to it.
+    /// Encoded bytes of the bricks sent to the worker for this frame.
     pub bytes_sent: u64,
 }
 
@@ -65,11 +68,11 @@ pub struct WorkerStats {
 /// that its brick's footprint overlaps.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct VoxelStats {
-    /// Relevant voxels of the volume under the held support.
+    /// Number of relevant voxels of the volume under the held support.
     pub relevant: u64,
-    /// Candidates that were transformed and put into a sheet's bucket.
+    /// Number of candidates that were transformed and put into a sheet's bucket.
     pub tossed: u64,
-    /// Candidates that were drawn.
+    /// Number of candidates that were drawn.
     pub splatted: u64,
     /// Candidates dropped because all they could touch was shut: with their brick at the master or
     /// the worker, or alone. For a block of bricks that a part of the picture never looked into,
@@ -80,35 +83,35 @@ pub struct VoxelStats {
 /// Numbers of bricks by what happened to them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BrickStats {
-    /// Bricks with a relevant voxel.
+    /// Number of the volume's bricks that have a relevant voxel.
     pub relevant: u64,
     /// Bricks that the view touches and the front slabs do not hide; under the `region` schedule,
     /// bricks that were drawn from.
     pub needed: u64,
-    /// Relevant voxels in needed bricks.
+    /// Number of relevant voxels in the needed bricks.
     #[serde(default)]
     pub needed_voxels: u64,
 }
 
-/// One macrotile of one slab.
+/// Statistics of one macrotile of one slab.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TileStats {
-    /// Left column in pixels.
+    /// Left column of the macrotile, in pixels of the picture.
     pub x: u32,
-    /// Top row in pixels.
+    /// Top row of the macrotile, in pixels of the picture.
     pub y: u32,
-    /// Edge in pixels.
+    /// Edge of the macrotile in pixels, before the picture clips it.
     pub size: u32,
     /// Estimated workload: open pixels under brick boxes (paper section 4.3). Under the `region`
     /// schedule, for a tile drawn in an earlier frame, its time then in the same unit.
     pub est: u64,
-    /// Render time in milliseconds.
+    /// Milliseconds that the macrotile took to render.
     pub ms: f64,
     /// Name of the worker that rendered it.
     pub worker: String,
 }
 
-/// One slab.
+/// Statistics of one slab of a frame.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct SlabStats {
     /// Macrotiles in the order of the queue.
@@ -124,7 +127,7 @@ pub struct SlabStats {
 /// Data that the scene did not need.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LeftOut {
-    /// Name of the data (`normals`).
+    /// Name of the data that were left out, for example `normals`.
     pub name: String,
     /// Time saved in milliseconds; `null` where it was not measured.
     pub saved_ms: Option<f64>,
@@ -149,7 +152,7 @@ pub struct BoundAndEstimate {
     pub estimate: Option<f64>,
 }
 
-/// An estimate of an error.
+/// An estimate of an error, which single pixels may exceed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Estimate {
     /// The estimate in 1/255; `null` where none was made.
@@ -175,20 +178,20 @@ pub struct ErrorStats {
     /// sheet adds less than half its last bit.
     #[serde(default)]
     pub accumulation: Bound,
-    /// Kernel tails cut off.
+    /// Error of kernel tails that are cut off at the support radius.
     pub truncation: BoundAndEstimate,
-    /// Sheets of finite thickness.
+    /// Error of sheets that have a thickness, against the limit of thin ones.
     pub thickness: Estimate,
-    /// Ripple of the kernel on a constant field.
+    /// Error of the kernel's ripple on a constant field.
     pub ripple: Estimate,
 }
 
-/// Statistics of one frame.
+/// Statistics of one frame: one line of JSON.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FrameStats {
-    /// Format version, 1.
+    /// Version of the statistics format; 1 is the only one.
     pub v: u32,
-    /// Frame number in its path.
+    /// Number of the frame in its path, from 0.
     pub frame: u64,
     /// Schedule under which the frame was rendered.
     #[serde(default = "slab")]
@@ -198,15 +201,15 @@ pub struct FrameStats {
     /// SHA-256 of the linear pixels, in hexadecimal. Empty where the job did not ask for it: tiles
     /// then come encoded, and the master never has the linear picture.
     pub pixels_sha256: String,
-    /// `PIXELS_VERSION` of the programs.
+    /// Version of the pixels, `PIXELS_VERSION`, which the master and all workers share.
     pub pixels_version: u32,
-    /// Times by cause.
+    /// Milliseconds of the frame, by cause.
     pub ms: FrameMs,
-    /// Workers, by name.
+    /// Each worker's part in the frame, sorted by name.
     pub workers: Vec<WorkerStats>,
-    /// Voxel counts.
+    /// Numbers of voxels that were tossed, drawn and culled.
     pub voxels: VoxelStats,
-    /// Brick counts.
+    /// Numbers of bricks that the frame had and needed.
     pub bricks: BrickStats,
     /// Bytes of the results that counted, as messages; `null` where none crossed a network.
     #[serde(default)]
@@ -216,23 +219,23 @@ pub struct FrameStats {
     pub slabs: Vec<SlabStats>,
     /// Quality, with the sums that were used.
     pub quality: Quality,
-    /// Data that were left out.
+    /// Data that the scene did not need, so that nobody computed or sent them.
     pub left_out: Vec<LeftOut>,
-    /// Errors by source.
+    /// Errors of the picture, by source.
     pub error: ErrorStats,
-    /// Leases given out again because their worker was lost or late.
+    /// Number of leases given out again because their worker was lost or late.
     #[serde(default)]
     pub retries: u64,
     /// Tiles split while drawn, a piece of which went to an idle worker (work stealing).
     #[serde(default)]
     pub handed_over: u64,
-    /// Results that came too late or twice and were dropped.
+    /// Number of results that came too late or twice and were dropped.
     #[serde(default)]
     pub dropped_results: u64,
     /// Tiles given up after three workers were lost with them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub poisoned: Vec<PoisonedTile>,
-    /// What the frame waited for, in one sentence for people.
+    /// Reason for the frame's length, one sentence for people.
     #[serde(default)]
     pub critical_path: Option<String>,
     /// Whether workers only waited for recorded times; there is no picture then.
@@ -243,13 +246,13 @@ pub struct FrameStats {
 /// A macrotile that took three workers with it. Its pixels stay as the slabs in front left them.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PoisonedTile {
-    /// Slab number, front to back.
+    /// Number of the slab, front to back, from 0.
     pub slab: u32,
-    /// Left column in pixels.
+    /// Left column of the macrotile, in pixels of the picture.
     pub x: u32,
-    /// Top row in pixels.
+    /// Top row of the macrotile, in pixels of the picture.
     pub y: u32,
-    /// Edge in pixels.
+    /// Edge of the macrotile in pixels, before the picture clips it.
     pub size: u32,
     /// Names of the workers that were lost with it.
     pub workers: Vec<String>,

@@ -42,7 +42,7 @@ pub enum ColorSpace {
     Linear,
 }
 
-/// Meaning of an opacity.
+/// Unit of the opacities of a transfer function.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OpacityUnit {
@@ -57,9 +57,9 @@ pub enum OpacityUnit {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NanColour {
-    /// Colour, in the transfer function's colour space.
+    /// Red, green and blue of NaN samples, 0 to 1, in the transfer function's colour space.
     pub color: [f64; 3],
-    /// Opacity, in the transfer function's unit.
+    /// Opacity of NaN samples, in the transfer function's opacity unit.
     pub opacity: f64,
 }
 
@@ -69,28 +69,28 @@ pub struct NanColour {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TransferFunction {
-    /// Format version, 1.
+    /// Version of the transfer function format; 1 is the only one.
     pub version: u32,
-    /// Meaning of x.
+    /// Meaning of the points' x: values of the file, or shares of their range.
     pub domain: Domain,
-    /// Colour points `[x, r, g, b]`.
+    /// Colour points `[x, r, g, b]`, ascending in x; r, g, b are 0 to 1.
     pub colors: Vec<[f64; 4]>,
-    /// Opacity points `[x, a]`.
+    /// Opacity points `[x, opacity]`, ascending in x.
     pub opacities: Vec<[f64; 2]>,
-    /// Meaning of r, g, b.
+    /// Meaning of the colours' numbers: sRGB or linear light.
     #[serde(default)]
     pub color_space: ColorSpace,
-    /// Meaning of a.
+    /// Unit of the opacities: alpha per vox, or extinction per world unit.
     #[serde(default)]
     pub opacity_unit: OpacityUnit,
-    /// Colour and opacity of NaN.
+    /// Colour and opacity of samples that are NaN.
     #[serde(default)]
     pub nan: NanColour,
     /// Points `[gradient magnitude, factor]` that opacities are multiplied by. Magnitudes are the
     /// change of value over one vox as a share of the range; over file values, per world unit.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub gradient_opacity: Vec<[f64; 2]>,
-    /// Light on voxels.
+    /// Light on the voxels.
     #[serde(default)]
     pub shading: Shading,
 }
@@ -212,7 +212,7 @@ impl TransferFunction {
 pub struct OpticalSample {
     /// Extinction per vox of travel, capped; for [`Compositing::Paper`] alpha per vox.
     pub sigma: f32,
-    /// Linear RGB.
+    /// Linear red, green and blue, 0 to 1.
     pub rgb: [f32; 3],
 }
 
@@ -557,7 +557,7 @@ impl Classifier {
 pub struct Support {
     /// Closed intervals of codes, ascending and disjoint.
     pub intervals: Vec<(f64, f64)>,
-    /// Whether NaN is visible.
+    /// Whether NaN samples are visible.
     pub nan: bool,
 }
 

@@ -62,7 +62,7 @@ pub struct Camera {
     pub up: DVec3,
     /// Target in world units, relative to the centre of the volume's box.
     pub target: DVec3,
-    /// Projection.
+    /// Kind of projection, with the extent that the picture shows.
     pub projection: CameraProjection,
 }
 
@@ -95,9 +95,9 @@ pub struct View {
     pub eye_origin: DVec3,
     /// Rotation from world to eye axes.
     pub eye_from_world: DMat3,
-    /// Projection to pixels.
+    /// Projection from eye space to pixels, parallel or central.
     pub projection: Projection,
-    /// Sheet thickness in vox.
+    /// Thickness of a sheet in vox.
     pub thickness: f64,
     /// Standard deviation of the kernel's profiles along the eye's axes, in vox, before the kernel
     /// leans.
@@ -476,7 +476,8 @@ impl View {
 /// leaves that integer in the low bits of the sum.
 pub const ROUND_F64: f64 = 6_755_399_441_055_744.0;
 
-/// Returns the nearest integer, ties to even, without a library call. `|x| < 2^31`.
+/// Returns the integer nearest to the number `x`, ties to even, without a library call. `|x| <
+/// 2^31`.
 #[inline(always)]
 pub fn round_i32(x: f64) -> i32 {
     (x + ROUND_F64).to_bits() as i32
@@ -500,7 +501,8 @@ fn ceil(x: f64) -> f64 {
     -floor(-x)
 }
 
-/// Returns the nearest integer, ties to even, without a library call. `|x| < 2^51`.
+/// Returns the integer nearest to the number `x`, ties to even, without a library call. `|x| <
+/// 2^51`.
 #[inline(always)]
 pub fn round_i64(x: f64) -> i64 {
     (x + ROUND_F64).to_bits().wrapping_sub(ROUND_F64.to_bits()) as i64

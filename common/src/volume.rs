@@ -4,7 +4,7 @@ use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-/// Where a volume's samples lie. World units are the file's (mm), world axes anatomical (RAS+)
+/// Lattice of a volume's samples. World units are the file's (mm), world axes anatomical (RAS+)
 /// where the file has them (docs/design/contracts.md, World and camera).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lattice {
@@ -31,7 +31,7 @@ impl Lattice {
         }
     }
 
-    /// Returns the number of samples.
+    /// Returns the number of samples on the lattice.
     pub fn len(&self) -> usize {
         self.dims.iter().map(|&n| n as usize).product()
     }
@@ -162,7 +162,7 @@ pub enum Samples {
     F32(Vec<f32>),
 }
 
-/// Type of [`Samples`].
+/// Number type of a volume's [`Samples`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum SampleKind {
@@ -175,7 +175,7 @@ pub enum SampleKind {
 }
 
 impl SampleKind {
-    /// Returns the bytes a sample.
+    /// Returns the number of bytes that one sample takes.
     pub fn bytes(self) -> usize {
         match self {
             SampleKind::U8 => 1,
@@ -186,7 +186,7 @@ impl SampleKind {
 }
 
 impl Samples {
-    /// Returns the number of samples.
+    /// Returns the number of samples stored.
     pub fn len(&self) -> usize {
         match self {
             Samples::U8(v) => v.len(),
@@ -260,9 +260,9 @@ impl Samples {
 /// Map from stored codes to the file's values: `value = offset + scale * code`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ValueMap {
-    /// Value of one code step.
+    /// Difference in value between a code and the next.
     pub scale: f64,
-    /// Value of code 0.
+    /// Value that code 0 stands for.
     pub offset: f64,
 }
 
@@ -280,13 +280,13 @@ impl ValueMap {
 /// Range and histogram of a volume's values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ValueSummary {
-    /// Stored type.
+    /// Number type of the stored sample codes.
     pub kind: SampleKind,
-    /// Map from codes to values.
+    /// Linear map from codes to the file's values.
     pub map: ValueMap,
-    /// Smallest finite code.
+    /// Smallest finite sample code of the volume.
     pub min_code: f64,
-    /// Largest finite code.
+    /// Largest finite sample code of the volume.
     pub max_code: f64,
     /// Counts of finite samples in 256 equal bins from the smallest to the largest code. In 8-bit
     /// volumes bin = code instead, so that no two codes share a bin.
@@ -389,7 +389,7 @@ impl ValueSummary {
     }
 }
 
-/// A volume in memory.
+/// A volume in memory: its lattice, samples and names.
 #[derive(Clone, Debug)]
 pub struct Volume {
     /// Name for people (the file's, without folders).
@@ -398,7 +398,7 @@ pub struct Volume {
     pub file_type: String,
     /// Whether the file says where the patient's right, anterior and superior are.
     pub anatomical: bool,
-    /// Where the samples lie.
+    /// Lattice that the samples lie on.
     pub lattice: Lattice,
     /// The samples, i fastest, then j, then k.
     pub samples: Samples,
@@ -532,15 +532,15 @@ impl Volume {
 /// A volume without its samples: what master, workers and clients share.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VolumeInfo {
-    /// Digest of the volume ([`Volume::digest`]).
+    /// Digest of the volume as [`Volume::digest`] gives it.
     pub digest: Digest32,
-    /// Where the samples lie.
+    /// Lattice that the samples lie on.
     pub lattice: Lattice,
     /// Range, histogram, and map from codes to values.
     pub summary: ValueSummary,
 }
 
-/// A SHA-256, shown in hexadecimal.
+/// A SHA-256 digest of 32 bytes, shown as 64 hexadecimal digits.
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Digest32(pub [u8; 32]);
 

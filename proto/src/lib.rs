@@ -50,7 +50,8 @@ pub mod cluster_v1 {
     tonic::include_proto!("slabcast.cluster.v1");
 }
 
-/// The compiled `.proto` files with their comments, for server reflection.
+/// Bytes of the compiled `.proto` files with their comments, an encoded `FileDescriptorSet`, for
+/// server reflection.
 pub const FILE_DESCRIPTOR_SET: &[u8] =
     include_bytes!(concat!(env!("OUT_DIR"), "/slabcast_descriptor.bin"));
 

@@ -11,7 +11,7 @@ use slabcast_common::volume::VolumeInfo;
 use slabcast_scene::path::Orientation;
 use std::time::Duration;
 
-/// State of a job.
+/// State of a job, from its queue to its end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum JobState {
     /// Other jobs come first.
@@ -54,11 +54,11 @@ impl std::fmt::Display for JobState {
 /// State of a job, sent between its frames.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct JobNotice {
-    /// Its state.
+    /// State that the job is in now.
     pub state: JobState,
-    /// Frames that are finished.
+    /// Number of the job's frames that are finished.
     pub frames_done: u64,
-    /// Frames of the path.
+    /// Number of frames in the job's path.
     pub frames_total: u64,
     /// Render threads of the workers that are connected.
     pub render_threads: u32,
@@ -71,19 +71,19 @@ pub struct JobNotice {
 pub struct Job {
     /// Id of the job, for all calls (`job-7`).
     pub job_id: String,
-    /// The submitter's name for it.
+    /// Name that the submitter gave the job.
     pub client_key: String,
-    /// Its state.
+    /// State that the job is in now.
     pub state: JobState,
     /// For people: why the job waits or failed, and what to do. May be empty.
     pub message: String,
-    /// Frames that are finished.
+    /// Number of the job's frames that are finished.
     pub frames_done: u64,
-    /// Frames of the path.
+    /// Number of frames in the job's path.
     pub frames_total: u64,
-    /// Width and height of its frames in pixels.
+    /// Width and height of the job's frames in pixels.
     pub size: [u32; 2],
-    /// Format of its frames.
+    /// Pixel format of the job's frames.
     pub format: PixelFormat,
     /// When it was submitted, in milliseconds since 1970 UTC.
     pub submitted_unix_ms: i64,
@@ -100,11 +100,11 @@ pub struct VolumeDescription {
     pub file_type: String,
     /// Whether the file says where right, anterior and superior are.
     pub anatomical: bool,
-    /// Lattice, values and digest.
+    /// Lattice of the volume, summary of its values, and its digest.
     pub info: VolumeInfo,
     /// Axes that are up and front unless a path says otherwise.
     pub orientation: Orientation,
-    /// The master's `PIXELS_VERSION`.
+    /// Version of the pixels, `PIXELS_VERSION`, of the master's program.
     pub pixels_version: u32,
     /// The master's `PROTOCOL_VERSION`: the newest version of `slabcast.cluster.v1` it speaks.
     pub protocol_version: u32,
@@ -121,36 +121,36 @@ pub struct Worker {
     pub name: String,
     /// Address that it called from; empty for a worker within the master's process.
     pub address: String,
-    /// Render threads.
+    /// Number of the worker's render threads.
     pub threads: u32,
-    /// Instruction set of its renderer.
+    /// Instruction set that the worker's renderer uses.
     pub simd: String,
     /// Bytes of bricks that it may hold.
     pub memory_budget_bytes: u64,
     /// Bytes of bricks that it holds.
     pub held_bytes: u64,
-    /// Bricks that it holds.
+    /// Number of bricks that the worker holds.
     pub held_bricks: u64,
-    /// Tasks that are lent to it now.
+    /// Number of tasks that are lent to the worker now.
     pub tasks_lent: u32,
-    /// Tasks that it has finished since it joined.
+    /// Number of tasks that the worker has finished since it joined.
     pub tasks_done: u64,
     /// Time since the master last heard from it.
     pub silent: Duration,
-    /// Time since it joined.
+    /// Time since the worker joined.
     pub connected: Duration,
     /// Whether it is lent nothing for now, since frames would not be finished sooner with it.
     pub in_reserve: bool,
 }
 
-/// A piece of a frame.
+/// A piece of a finished frame on its way to a client.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameChunk {
     /// Number of the frame in its job.
     pub frame: u64,
     /// Width and height in pixels, 1 to 8192 each.
     pub size: [u32; 2],
-    /// Format of the pixels.
+    /// Format of the frame's pixels.
     pub format: PixelFormat,
     /// Offset of `data` within the frame, in bytes.
     pub offset: u64,
@@ -164,7 +164,7 @@ pub struct FrameChunk {
     pub trace_json: String,
 }
 
-/// One message of a watch.
+/// One message of `WatchFrames`: a piece of a frame, or news of the job.
 #[derive(Clone, Debug, PartialEq)]
 pub enum WatchMessage {
     /// A piece of a frame.

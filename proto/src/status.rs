@@ -58,7 +58,7 @@ impl Reason {
         Reason::TooLate,
     ];
 
-    /// Returns ErrorInfo.reason, in capitals (`JOB_NOT_FOUND`).
+    /// Returns the reason as `ErrorInfo.reason` has it, in capitals (`JOB_NOT_FOUND`).
     pub fn name(self) -> &'static str {
         match self {
             Reason::InvalidField => "INVALID_FIELD",
@@ -126,11 +126,11 @@ pub struct Details {
     /// Reason of the ErrorInfo; `None` if there is none, of another domain, or newer than this
     /// program.
     pub reason: Option<Reason>,
-    /// Metadata of the ErrorInfo.
+    /// Metadata of the status's `ErrorInfo`, by key.
     pub metadata: BTreeMap<String, String>,
     /// The first field violation of the BadRequest: path and description.
     pub field: Option<(String, String)>,
-    /// Delay of the RetryInfo.
+    /// Time after which to try again, from the status's `RetryInfo`; `None` if there is none.
     pub retry_after: Option<Duration>,
 }
 

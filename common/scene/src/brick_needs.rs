@@ -11,10 +11,11 @@ use slabcast_common::quality::{Compositing, InvalidField, Keep};
 use slabcast_common::transfer::{Classifier, Support, TransferFunction};
 use slabcast_common::volume::{Digest32, VolumeInfo};
 
-/// What the bricks of a job must hold.
+/// Data that the bricks of a job must hold: visible voxels, and normals or gradients where the
+/// transfer function uses them.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BrickNeeds {
-    /// Visible sample codes.
+    /// Sample codes that are visible, so whose voxels are stored.
     pub support: Support,
     /// Whether each voxel needs its normal.
     pub normals: bool,

@@ -48,14 +48,14 @@ struct Map {
 /// A colour map as it was read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ColourMap {
-    /// ParaView's name of the map.
+    /// Name of the map as ParaView's file gives it; `None` if it gives none.
     pub name: Option<String>,
     /// Colour points `[x, r, g, b]` over file values, sRGB numbers, for interpolation in linear
     /// light.
     pub colours: Vec<[f64; 4]>,
     /// Opacity points `[x, alpha]`; empty where the file has none.
     pub opacities: Vec<[f64; 2]>,
-    /// Colour and opacity of NaN.
+    /// Colour and opacity of samples that are NaN.
     pub nan: NanColour,
 }
 

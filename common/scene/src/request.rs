@@ -10,17 +10,17 @@ use slabcast_common::quality::{Quality, Work};
 pub struct PathRequest {
     /// The client's own name for the request; the same key gives the same job.
     pub client_key: String,
-    /// The views.
+    /// Views of the job, one for each frame.
     pub path: ViewPath,
-    /// Colours and opacities.
+    /// Colours and opacities of the volume: a preset or a whole transfer function.
     pub transfer: TransferChoice,
-    /// Quality of the pictures.
+    /// Quality of the pictures: all that changes pixels beside volume, views and colours.
     pub quality: Quality,
     /// How the work is cut and scheduled.
     pub work: Work,
     /// Format in which pixels leave the master.
     pub format: PixelFormat,
-    /// Background behind the volume.
+    /// Background that the volume is composited over.
     pub background: Background,
     /// Whether each frame's statistics come with spans for a trace.
     pub want_trace: bool,

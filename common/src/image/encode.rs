@@ -5,7 +5,7 @@ use crate::math::{linear_from_srgb, srgb_from_linear};
 use serde::{Deserialize, Serialize};
 use std::sync::OnceLock;
 
-/// Background of a picture.
+/// Background that a finished picture is composited over.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Background {
@@ -30,7 +30,7 @@ pub enum PixelFormat {
 }
 
 impl PixelFormat {
-    /// Returns the bytes a pixel.
+    /// Returns the number of bytes that one pixel takes in this format.
     pub fn bytes(self) -> usize {
         match self {
             PixelFormat::Rgb8 => 3,
@@ -44,9 +44,9 @@ impl PixelFormat {
 /// How finished pixels are encoded: format, and the background they are composited over.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PixelEncoding {
-    /// Pixel format.
+    /// Number type and layout of an encoded pixel.
     pub format: PixelFormat,
-    /// Background behind the volume.
+    /// Background that pixels are composited over before they are encoded.
     pub background: Background,
 }
 

@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 /// background.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Picture {
-    /// Width and height in pixels.
+    /// Width and height of the picture in pixels.
     pub size: [u32; 2],
     /// Linear premultiplied RGBA, row-major from the top left.
     pub pixels: Vec<[f32; 4]>,
@@ -36,7 +36,7 @@ impl Picture {
 pub struct Encoded {
     /// Hash as [`Picture::sha256`] gives it; `None` if the job did not ask.
     pub sha256: Option<Digest32>,
-    /// Bytes as [`Picture::encode`] gives them.
+    /// Bytes of the picture as [`Picture::encode`] gives them.
     pub bytes: Vec<u8>,
 }
 

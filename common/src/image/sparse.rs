@@ -15,10 +15,10 @@ use crate::occlusion::Rect;
 pub struct SparseTile {
     /// Width and height of the tile in pixels.
     pub size: [u32; 2],
-    /// Pixel format.
+    /// Format of the tile's encoded pixels.
     pub format: PixelFormat,
-    /// Which leaves are present: a bit each, row-major, leaf i at bit i % 8 of byte i / 8. Leaves
-    /// at the right and at the bottom are cut by the tile.
+    /// One bit for each leaf, row-major: whether the leaf is present. Leaf i is bit i % 8 of byte i
+    /// / 8. The tile cuts leaves at its right and bottom edge.
     pub mask: Vec<u8>,
     /// Pixels of the present leaves, one leaf after the other, row-major in each.
     pub data: Vec<u8>,

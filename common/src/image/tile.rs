@@ -23,12 +23,14 @@ pub struct TileState {
     pub last: Option<Vec<RawSums>>,
 }
 
-/// Pixels that a task returns.
+/// Pixels of a finished task: its slab image as a continuation (opacity, colour added, last sheet's
+/// sums), row-major in the tile.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TilePixels {
     /// Accumulated opacity A behind the slab, row-major in the tile.
     pub a: Vec<f32>,
-    /// Premultiplied colour that the slab adds, in units of [`COLOUR_UNIT`].
+    /// Premultiplied linear colour (RGB) that the slab adds, in units of [`COLOUR_UNIT`], row-major
+    /// in the tile.
     pub colour: Vec<[u32; 3]>,
     /// Raw sums of the slab's last sheet; `None` if all are zero.
     pub last: Option<Vec<RawSums>>,

@@ -43,7 +43,7 @@ pub const MAX_BYTES: u64 = 1 << 30;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Trace {
-    /// Format of the file: [`VERSION`].
+    /// Version of the file's format; [`VERSION`] is the newest.
     pub version: u32,
     /// Scene, machine and program that were recorded.
     pub about: About,
@@ -61,7 +61,7 @@ pub struct About {
     pub transfer: String,
     /// Instruction set of the splat loops.
     pub simd: String,
-    /// `PIXELS_VERSION` of the program that drew.
+    /// Version of the pixels, `PIXELS_VERSION`, of the program that drew.
     pub pixels_version: u32,
     /// Version of the program that drew.
     pub program: String,
@@ -100,7 +100,7 @@ pub struct Pings {
     pub company_ns: [u64; 3],
 }
 
-/// Times of one recorded frame.
+/// Times of one recorded frame: tables, slabs and regions.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FrameTrace {
@@ -132,14 +132,14 @@ pub struct FrameTrace {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SlabTrace {
-    /// First sheet.
+    /// Number of the slab's first sheet.
     pub first: i32,
-    /// One past the last sheet.
+    /// Number one past the slab's last sheet.
     pub end: i32,
     /// Pixels behind the slab as run lengths, row-major over the picture: open, shut, open and so
     /// on. Pixels beyond the last run are open.
     pub shut: Vec<u32>,
-    /// Tiles by size.
+    /// Tiles of the slab, grouped by size.
     pub levels: Vec<Level>,
 }
 
@@ -157,7 +157,7 @@ pub struct Level {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RegionLevel {
-    /// Edge in pixels.
+    /// Edge of the tiles in pixels, before the picture clips them.
     pub edge: u32,
     /// Tiles with something in them, by row and column.
     pub tiles: Vec<RegionTile>,
@@ -172,9 +172,9 @@ type WrittenRegionTile = (u32, u32, u64, [u32; 2], Vec<u32>, Vec<u32>, Vec<u16>,
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "WrittenRegionTile", into = "WrittenRegionTile")]
 pub struct RegionTile {
-    /// Left column, in pixels.
+    /// Left column of the tile, in pixels of the picture.
     pub x: u32,
-    /// Top row, in pixels.
+    /// Top row of the tile, in pixels of the picture.
     pub y: u32,
     /// Nanoseconds to draw it, its blocks of bricks being known.
     pub ns: u64,
@@ -232,15 +232,15 @@ impl From<RegionTile> for WrittenRegionTile {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "[u64; 5]", into = "[u64; 5]")]
 pub struct TileTrace {
-    /// Left column, in pixels.
+    /// Left column of the tile, in pixels of the picture.
     pub x: u32,
-    /// Top row, in pixels.
+    /// Top row of the tile, in pixels of the picture.
     pub y: u32,
-    /// Nanoseconds to draw it.
+    /// Nanoseconds to draw the tile.
     pub ns: u64,
-    /// Bytes of its lease on the wire.
+    /// Bytes of the tile's lease on the wire.
     pub lease_bytes: u32,
-    /// Bytes of its result on the wire.
+    /// Bytes of the tile's result on the wire.
     pub result_bytes: u32,
 }
 

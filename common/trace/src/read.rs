@@ -96,7 +96,7 @@ impl Trace {
         Ok(trace)
     }
 
-    /// Returns the trace as JSON.
+    /// Returns the trace as one line of JSON, which [`Trace::from_json`] reads.
     pub fn to_json(&self) -> String {
         serde_json::to_string(self).expect("plain numbers and texts")
     }

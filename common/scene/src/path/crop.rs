@@ -24,13 +24,13 @@ pub enum CropUnit {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Crop {
-    /// Unit of the numbers.
+    /// Unit of the ends: world units, or shares of the volume's box.
     pub unit: CropUnit,
-    /// Lower and upper end along x.
+    /// Lower and upper end along the world's x axis, in `unit`; `None` does not crop.
     pub x: [Option<f64>; 2],
-    /// Lower and upper end along y.
+    /// Lower and upper end along the world's y axis, in `unit`; `None` does not crop.
     pub y: [Option<f64>; 2],
-    /// Lower and upper end along z.
+    /// Lower and upper end along the world's z axis, in `unit`; `None` does not crop.
     pub z: [Option<f64>; 2],
 }
 

@@ -20,7 +20,7 @@ pub(super) const MAX_POINTS: usize = 10_000;
 /// them it is off by four times that.
 const PIECES: usize = 64;
 
-/// A flight through points.
+/// A flight: a path whose eye passes through given points on a smooth curve.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FlyThrough {
@@ -31,7 +31,7 @@ pub struct FlyThrough {
     /// Point that the eye looks at, in world units; `None` looks ahead.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub target: Option<[f64; 3]>,
-    /// Up direction of the picture; default the volume's up.
+    /// Up direction of the picture in world axes, of any length; `None` takes the volume's up.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub up: Option<[f64; 3]>,
     /// Vertical full field of view in degrees; default 60.

@@ -14,10 +14,10 @@ use slabcast_common::quality::InvalidField;
 use slabcast_common::view::{Camera, CameraProjection};
 use slabcast_common::volume::Lattice;
 
-/// Most keys of a path.
+/// Largest number of keys that one path may have; [`KeyFrames`] with more are refused.
 pub const MAX_KEYS: usize = 10_000;
 
-/// Motion between two keys.
+/// Kind of motion between two keys of a path.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Easing {
@@ -47,7 +47,7 @@ pub enum Side {
 }
 
 impl Side {
-    /// Every side with its name.
+    /// All six sides of an anatomical volume, each with the name that a user writes.
     pub const NAMES: [(&'static str, Side); 6] = [
         ("anterior", Side::Anterior),
         ("left", Side::Left),
@@ -98,7 +98,8 @@ pub struct Key {
     /// Point that the eye looks at, in world units; default the volume's centre.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub target: Option<[f64; 3]>,
-    /// Up direction of the picture, beside `eye`; default the volume's up.
+    /// Up direction of the picture in world axes, of any length; only beside `eye`. `None` takes
+    /// the volume's up.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub up: Option<[f64; 3]>,
     /// Kind of projection, the same for all keys.
@@ -121,7 +122,7 @@ pub struct Key {
 pub struct KeyFrames {
     /// Number of frames of the path.
     pub frames: u32,
-    /// Motion between keys.
+    /// Kind of motion between neighbouring keys: smooth or at constant speed.
     #[serde(default)]
     pub easing: Easing,
     /// Up axis; default that of the volume.

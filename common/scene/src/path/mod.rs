@@ -21,14 +21,14 @@ use slabcast_common::quality::{InvalidField, json_error};
 use slabcast_common::view::{Camera, CameraProjection};
 use slabcast_common::volume::{Lattice, ValueSummary};
 
-/// Most frames of one path.
+/// Largest number of frames that one path may have; a path with more is refused.
 pub const MAX_FRAMES: usize = 100_000;
 
 /// A world axis with a sign, written `+z`, `z` or `-y`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Axis {
-    /// 0, 1 or 2 for x, y or z.
+    /// Index of the axis: 0, 1 or 2 for x, y or z.
     pub index: usize,
     /// Whether the axis points the negative way.
     pub negative: bool,
@@ -103,13 +103,13 @@ pub enum ProjectionKind {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PathView {
-    /// Position of the eye in the world.
+    /// Position of the eye in world units.
     pub eye: [f64; 3],
-    /// Point that the eye looks at.
+    /// Point that the eye looks at, in world units.
     pub target: [f64; 3],
-    /// Up direction of the picture.
+    /// Up direction of the picture in world axes, of any length.
     pub up: [f64; 3],
-    /// Kind of projection.
+    /// Kind of projection: parallel or central.
     pub projection: ProjectionKind,
     /// World height shown (`ortho`); default 1.25 times the largest extent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -125,7 +125,7 @@ pub struct PathView {
 pub struct Turntable {
     /// Azimuth of the first frame in degrees from the front.
     pub start: f64,
-    /// Degrees from frame to frame.
+    /// Angle between neighbouring frames, in degrees of azimuth.
     pub step: f64,
     /// Number of frames, 1 to [`MAX_FRAMES`].
     pub frames: u32,
@@ -134,7 +134,7 @@ pub struct Turntable {
     /// World height shown at the target; default 1.25 times the largest extent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub height: Option<f64>,
-    /// Kind of projection.
+    /// Kind of projection: parallel or central.
     pub projection: ProjectionKind,
     /// Vertical full field of view in degrees (`persp`).
     pub fov: f64,
@@ -167,20 +167,20 @@ impl Default for Turntable {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ViewPath {
-    /// Format version, 1.
+    /// Version of the path format; 1 is the only one.
     pub version: u32,
     /// Width and height of the pictures in pixels.
     pub size: [u32; 2],
-    /// Explicit cameras, one a frame.
+    /// Explicit cameras, one for each frame; empty where another field makes the path.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub views: Vec<PathView>,
     /// A turn about the up axis.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub turntable: Option<Turntable>,
-    /// Key frames with curves between.
+    /// Key frames joined by curves; `None` where another field makes the path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub keyframes: Option<KeyFrames>,
-    /// A flight through points.
+    /// Flight through points; `None` where another field makes the path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub flythrough: Option<FlyThrough>,
     /// Box outside of which the volume counts as empty; `None` for the whole volume.
@@ -195,7 +195,7 @@ pub struct ViewPath {
 /// Up and front axes of a volume.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Orientation {
-    /// Up axis.
+    /// World axis that points up in pictures.
     pub up: Axis,
     /// Front axis (anterior, for anatomical files).
     pub front: Axis,

@@ -35,7 +35,7 @@ const FLOOR: f64 = 1.25;
 /// Share of the volume above which foreground without a valley is a cloud.
 const CLOUD: f64 = 0.15;
 
-/// Kind of foreground.
+/// Kind of foreground that a histogram shows, by which presets choose their shape.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Content {
     /// A valley of the histogram separates it from the air.
@@ -53,22 +53,24 @@ pub enum Content {
 /// Levels of a histogram, as shares of the value range (0 to 1).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Levels {
-    /// Kind of foreground.
+    /// Kind of foreground that the histogram shows.
     pub content: Content,
-    /// Where the air ends: nothing is drawn below.
+    /// Upper end of the air, as a share of the value range (0 to 1): nothing is drawn below.
     pub air: f64,
-    /// Where a surface becomes opaque; above `air`.
+    /// Value at which a surface becomes opaque, as a share of the value range (0 to 1); above
+    /// `air`.
     pub solid: f64,
-    /// Median of what is above the air.
+    /// Median of the samples above the air, as a share of the value range (0 to 1).
     pub mid: f64,
-    /// Third quartile of what is above the air.
+    /// Third quartile of the samples above the air, as a share of the value range (0 to 1).
     pub dense: f64,
-    /// Ninth decile of what is above the air.
+    /// Ninth decile of the samples above the air, as a share of the value range (0 to 1).
     pub densest: f64,
-    /// Where colours end: 0.2 % of what is above the air exceeds it.
+    /// End of the colours, as a share of the value range (0 to 1): 0.2 % of the samples above the
+    /// air exceed it.
     pub top: f64,
-    /// Value of water in file units, where values are Hounsfield units but for an offset; else
-    /// `None`.
+    /// Value of water in the file's units, where values are Hounsfield units but for an offset;
+    /// else `None`.
     pub water: Option<f64>,
 }
 

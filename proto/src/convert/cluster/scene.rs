@@ -62,7 +62,7 @@ fn volume_from_wire(info: wire::Volume) -> Result<VolumeInfo, WireError> {
     Ok(VolumeInfo { digest: digest_from_wire("digest", &info.digest)?, lattice, summary })
 }
 
-/// Writes a scene.
+/// Converts a scene to its message on the wire.
 pub fn scene_to_wire(scene: &SceneSpec) -> wire::Scene {
     wire::Scene {
         scene: scene.id.0,
@@ -132,7 +132,7 @@ pub(super) fn frame_from_wire(frame: wire::Frame) -> Result<ToWorker, WireError>
     })
 }
 
-/// Writes a view.
+/// Converts a view to its message on the wire.
 pub fn view_to_wire(view: &View) -> wire::View {
     wire::View {
         width: view.size[0],

@@ -24,7 +24,7 @@ const TOKEN: &str = "after-";
 /// A page that a client asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Page {
-    /// Most entries, 1 to 1000.
+    /// Largest number of entries that the page may have, 1 to 1000.
     pub size: usize,
     /// Number of the last entry of the page before; `None` for the first page.
     pub after: Option<u64>,
@@ -84,7 +84,7 @@ fn duration_from_wire(field: &str, duration: Option<WireDuration>) -> Result<Dur
     }
 }
 
-/// Writes a job.
+/// Converts a job to the message that clients get.
 pub fn job_to_wire(job: &Job) -> wire::Job {
     wire::Job {
         job_id: job.job_id.clone(),
@@ -120,7 +120,7 @@ pub fn job_from_wire(job: wire::Job) -> Result<Job, WireError> {
     })
 }
 
-/// Writes a worker, for clients.
+/// Converts a worker to the message that clients get.
 pub fn worker_to_wire(worker: &Worker) -> wire::Worker {
     wire::Worker {
         worker_id: worker.id.to_string(),

@@ -39,18 +39,18 @@ pub enum Update {
     Frame(Box<ReceivedFrame>),
 }
 
-/// A whole frame.
+/// A whole frame as a client received it: pixels and statistics.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ReceivedFrame {
     /// Number of the frame in its job, from 0.
     pub number: u64,
-    /// Width and height in pixels.
+    /// Width and height of the frame in pixels.
     pub size: [u32; 2],
-    /// Format of `bytes`.
+    /// Format of the pixels in `bytes`.
     pub format: PixelFormat,
     /// Pixels, row-major from the top left, without padding.
     pub bytes: Vec<u8>,
-    /// Statistics of the frame.
+    /// Statistics of the frame's rendering.
     pub stats: FrameStats,
     /// Statistics as one line of JSON, version 1 (docs: statistics).
     pub stats_json: String,

@@ -26,7 +26,7 @@ const PLANS_AT_ONCE: usize = 2;
 /// Events that wait for the driver before whoever sends one has to wait.
 const INBOX: usize = 1024;
 
-/// Settings of a master.
+/// Settings of a master: its volume, memory, scheduler and record.
 pub struct MasterConfig {
     /// The volume that the master serves.
     pub volume: Arc<Volume>,
@@ -34,7 +34,7 @@ pub struct MasterConfig {
     pub orientation: Orientation,
     /// Bytes of finished frames that the master keeps.
     pub frame_budget_bytes: usize,
-    /// Settings of the scheduler.
+    /// Settings of the scheduler that the master drives.
     pub schedule: slabcast_schedule::Config,
     /// Recorder of the scheduler's events and decisions ([`crate::record::start`]).
     pub record: Option<Recorder>,
@@ -67,7 +67,7 @@ impl MasterConfig {
 pub struct ServedVolume {
     /// Name of the volume's file, without folders.
     pub name: String,
-    /// Sample type in the file.
+    /// Number type of the samples in the file, as its format names it.
     pub file_type: String,
     /// Whether world axes are anatomical (left, posterior, superior).
     pub anatomical: bool,

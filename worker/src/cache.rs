@@ -72,7 +72,7 @@ impl BrickCache {
         self.sets.iter().map(|(key, bricks)| (*key, bricks.keys().copied().collect())).collect()
     }
 
-    /// Returns the number of bricks.
+    /// Returns the number of bricks in the cache, over all sets.
     pub fn len(&self) -> usize {
         self.sets.values().map(BTreeMap::len).sum()
     }

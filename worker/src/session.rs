@@ -39,7 +39,7 @@ const DRAIN: Duration = Duration::from_secs(8);
 /// Longest time that a master may take to answer the hello.
 const UNTIL_WELCOME: Duration = Duration::from_secs(10);
 
-/// Settings of a worker.
+/// Settings of a worker: name, threads, memory, instruction set.
 #[derive(Clone, Debug)]
 pub struct Config {
     /// Name of the worker, for people.
@@ -48,7 +48,7 @@ pub struct Config {
     pub threads: u32,
     /// Encoded bytes of bricks that the worker may hold.
     pub memory_budget_bytes: u64,
-    /// Instruction set of the renderer.
+    /// Instruction set that the renderer uses.
     pub simd: Simd,
     /// A trace to rehearse: tiles are held for the trace's times, and nothing is drawn.
     pub rehearsal: Option<Arc<Rehearsal>>,
@@ -67,7 +67,7 @@ pub struct Link {
     pub bricks: mpsc::Receiver<Bricks>,
 }
 
-/// Reason why a session ended.
+/// Reason why a worker's session with its master ended.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Ended {
     /// The connection was lost, for this reason; dial again.

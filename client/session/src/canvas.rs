@@ -22,7 +22,7 @@ pub const VIRIDIS: [[u8; 3]; 11] = [
 ];
 /// Background of a new board, sRGB bytes.
 pub const PAPER: [u8; 3] = [24; 3];
-/// White, for text, sRGB bytes.
+/// Colour of text: white, as sRGB bytes.
 pub const WHITE: [u8; 3] = [255; 3];
 /// Height of a line of text, in dots.
 pub const LINE: usize = 9;
@@ -41,7 +41,7 @@ pub fn viridis(t: f64) -> [u8; 3] {
 
 /// A drawing board of 8-bit sRGB pixels.
 pub struct Canvas {
-    /// Width and height in pixels.
+    /// Width and height of the board in pixels.
     pub size: [usize; 2],
     /// Three bytes a pixel, sRGB, row-major from the top left.
     pub bytes: Vec<u8>,

@@ -22,7 +22,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 /// How a picture is cut for threads; never changes a byte.
 #[derive(Clone, Copy, Debug)]
 pub struct Cut {
-    /// Number of threads.
+    /// Number of threads that draw at once.
     pub threads: usize,
     /// Edge of the tiles in pixels; any number.
     pub tile: u32,

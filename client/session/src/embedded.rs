@@ -40,9 +40,9 @@ const SILENCE: u64 = 86_400_000_000;
 /// Number and size of the workers in this process.
 #[derive(Clone, Copy, Debug)]
 pub struct WorkerGroup {
-    /// Number of workers.
+    /// Number of workers in this process.
     pub workers: u32,
-    /// Render threads of each worker.
+    /// Number of render threads of each worker.
     pub threads: u32,
 }
 

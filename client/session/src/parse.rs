@@ -260,7 +260,7 @@ pub fn on_off(text: &str) -> Result<bool, String> {
     }
 }
 
-/// Numbers of workers, ascending.
+/// Numbers of workers to try, 1 to 1024 each, ascending and without repetition.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Workers(pub Vec<u32>);
 
@@ -398,7 +398,7 @@ pub fn png(text: &str) -> Result<std::path::PathBuf, String> {
     }
 }
 
-/// Number or range of frames.
+/// Frames that the user wants: how many, or which.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Frames {
     /// As many.

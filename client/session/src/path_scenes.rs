@@ -21,9 +21,9 @@ use std::sync::Arc;
 /// A scene's specification and all its bricks.
 #[derive(Clone)]
 pub struct SceneBricks {
-    /// Specification, sums decided.
+    /// Specification of the scene, with the number type of its sums decided.
     pub spec: SceneSpec,
-    /// All bricks of the scene.
+    /// All bricks of the scene, with their directory.
     pub bricks: Bricks,
 }
 
@@ -79,7 +79,7 @@ pub struct PathScenes {
     tween: Option<Tween>,
     /// Scene of all frames if there is no tween; it caches footprints.
     shared: Arc<Scene>,
-    /// Bricks for all frames.
+    /// Bricks that serve all frames of the path.
     pub bricks: Bricks,
 }
 

@@ -33,7 +33,7 @@ pub fn write_on_stderr(bytes: &[u8]) {
     });
 }
 
-/// Writes a line to stderr.
+/// Writes a line to stderr between redraws of the progress bar.
 pub fn say_on_stderr(line: &str) {
     write_on_stderr(format!("{line}\n").as_bytes());
 }
@@ -44,12 +44,12 @@ pub fn end() {
     let _ = bars().clear();
 }
 
-/// Writes `warning: ...` to stderr.
+/// Writes `warning: LINE` to stderr, without control characters of `line`.
 pub fn warn(line: &str) {
     say_on_stderr(&format!("{} {}", terminal::warning(), crate::terminal::one_line(line)));
 }
 
-/// Writes `note: ...` to stderr.
+/// Writes `note: LINE` to stderr, without control characters of `line`.
 pub fn note(line: &str) {
     say_on_stderr(&format!("{} {}", terminal::note(), crate::terminal::one_line(line)));
 }
@@ -209,7 +209,7 @@ impl Progress {
         bars().suspend(write)
     }
 
-    /// Removes the bar.
+    /// Removes the progress bar from the terminal.
     pub fn end(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();

@@ -27,7 +27,7 @@ pub fn listen() {
     }
 }
 
-/// Starts to listen.
+/// Starts to listen for Ctrl-C, which then no longer ends the process at once; a second one does.
 #[cfg(not(unix))]
 pub fn listen() {
     tokio::spawn(async {

@@ -12,7 +12,7 @@ use tokio::sync::mpsc;
 /// Time for cancelling before the command ends without the master's answer.
 const CANCEL: Duration = Duration::from_secs(2);
 
-/// News of a job.
+/// News of a job from whoever renders it.
 pub enum Update {
     /// The job's state.
     Step(Step),
@@ -36,7 +36,7 @@ pub enum Update {
 pub struct Source {
     /// Updates of the job, in order; the last is `Done` or an error.
     pub updates: mpsc::Receiver<Result<Update, Fail>>,
-    /// Cancels the job.
+    /// Way to cancel the job at the master.
     pub cancel: Cancel,
 }
 

@@ -139,7 +139,8 @@ impl Transfer {
         self.title.clone().unwrap_or_else(own)
     }
 
-    /// Returns its name for messages.
+    /// Returns the name of the transfer function for messages: the preset or the file; `given`
+    /// where it has neither.
     pub fn name(&self) -> String {
         match (&self.base, &self.file) {
             (TransferChoice::Name(name), _) => name.clone(),

@@ -43,7 +43,7 @@ pub const MAX_BYTES: u64 = 1 << 30;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Trace {
-    /// Version of the file's format; [`VERSION`] is the newest.
+    /// Version of the file's format; a program reads [`VERSION`] alone.
     pub version: u32,
     /// Scene, machine and program that were recorded.
     pub about: About,

@@ -8,7 +8,8 @@ use slabcast_common::message::ToWorker;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::stats::FrameStats;
 
-/// An output of [`Scheduler::next_action`](crate::Scheduler::next_action).
+/// An output of the scheduler for its driver to carry out, from
+/// [`Scheduler::next_action`](crate::Scheduler::next_action).
 #[derive(Clone, Debug)]
 #[expect(clippy::large_enum_variant, reason = "a view in a message; there is one action at a time")]
 pub enum Action {
@@ -79,38 +80,38 @@ pub enum Action {
 /// An interval in a frame's timeline, on the master's clock.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Span {
-    /// Label.
+    /// Label of the interval, for people.
     pub name: String,
-    /// "frame", "slab", "tile" or "bricks".
+    /// Kind of the interval: `frame`, `slab`, `tile` or `bricks`.
     pub category: &'static str,
-    /// Name of the worker; `None`: the master.
+    /// Name of the worker that the interval belongs to; `None` for the master.
     pub worker: Option<String>,
-    /// Index of the render thread.
+    /// Index of the worker's render thread, from 0.
     pub thread: u32,
-    /// Start, in microseconds.
+    /// Start of the interval, in microseconds on the master's clock.
     pub start: Micros,
-    /// End, in microseconds.
+    /// End of the interval, in microseconds on the master's clock.
     pub end: Micros,
-    /// Further attributes by name.
+    /// Further attributes to show, each a name and its value.
     pub args: Vec<(&'static str, String)>,
 }
 
 /// A worker as `ListWorkers` shows it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WorkerView {
-    /// The worker's id.
+    /// Id that the master gave the worker.
     pub id: WorkerId,
-    /// Display name.
+    /// Name of the worker, for people.
     pub name: String,
-    /// Number of render threads.
+    /// Number of the worker's render threads.
     pub threads: u32,
     /// Number of bricks the worker holds, over all sets.
     pub bricks_held: u64,
-    /// Encoded bytes of these bricks.
+    /// Encoded bytes of the bricks the worker holds, over all sets.
     pub bytes_held: u64,
-    /// Render threads with a lease.
+    /// Number of the worker's render threads that have a lease.
     pub busy: u32,
-    /// Leases without an answer.
+    /// Number of leases that the worker has not answered yet.
     pub leases: u32,
     /// When the worker joined, in microseconds on the master's clock.
     pub since: Micros,
@@ -120,13 +121,13 @@ pub struct WorkerView {
     pub in_reserve: bool,
 }
 
-/// Counters over the scheduler's lifetime.
+/// Counters of mishaps over the scheduler's lifetime.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Totals {
     /// Results that were dropped as late or duplicate, those of ended frames included.
     pub dropped_results: u64,
     /// Brick transfers beyond a worker's memory budget, for a lease that exceeds it by itself.
     pub over_budget: u64,
-    /// Workers lost, silent or dropped.
+    /// Number of workers that were lost, fell silent or were dropped.
     pub lost_workers: u64,
 }

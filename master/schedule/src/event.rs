@@ -8,27 +8,27 @@ use slabcast_common::quality::Work;
 use slabcast_common::view::View;
 use std::sync::Arc;
 
-/// One frame to render.
+/// One frame for the scheduler to have rendered.
 #[derive(Clone, Debug)]
 pub struct FrameJob {
     /// The frame's id. Ids are never reused.
     pub frame: FrameId,
     /// Index of the frame in its view path.
     pub number: u64,
-    /// Volume, transfer function and quality.
+    /// Volume, transfer function and quality of the frame.
     pub scene: Arc<SceneSpec>,
     /// All bricks of the set `scene.bricks`, ascending by id.
     pub bricks: Arc<[BrickInfo]>,
     /// Camera and picture size in pixels.
     pub view: View,
-    /// Schedule, slabs and tile size.
+    /// Schedule, number of slabs and tile size of the frame.
     pub work: Work,
     /// Format to which workers finish the pixels of regions. `None`: results are sums of light and
     /// opacity. Results of the `slab` schedule always are.
     pub finish: Option<PixelEncoding>,
 }
 
-/// An input of [`Scheduler::handle`](crate::Scheduler::handle).
+/// An input of the scheduler, given to [`Scheduler::handle`](crate::Scheduler::handle).
 #[derive(Clone, Debug)]
 pub enum Event {
     /// A worker sent a valid hello and was welcomed.

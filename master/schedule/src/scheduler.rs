@@ -519,7 +519,7 @@ impl Scheduler {
         roster.into_iter().chain(frame).min()
     }
 
-    /// Returns the workers, by id.
+    /// Returns all workers on the roster, in order of their ids.
     pub fn workers(&self) -> Vec<WorkerView> {
         let view = |(id, w): (WorkerId, &Worker)| {
             let leases = self.active.iter().map(|f| f.core().leases(id)).sum::<u32>();

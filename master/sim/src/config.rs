@@ -70,7 +70,7 @@ pub struct Costs {
     pub result: LinearCost,
     /// Driver: looks for the bricks of a frame to prefetch.
     pub prefetch_ns: f64,
-    /// Driver: handles any other event.
+    /// Driver: handles any other event, in nanoseconds.
     pub event_ns: f64,
     /// Driver: begins to work after it slept.
     pub driver_wake_ns: f64,
@@ -80,7 +80,7 @@ pub struct Costs {
     pub deliver_pixel_ns: f64,
     /// Client, where it runs on the master's machine: receives a pixel.
     pub client_pixel_ns: f64,
-    /// Master's streams: messages.
+    /// Master's streams: costs of reading and writing messages.
     pub master: MessageCosts,
     /// Master's finishers: hash and encode a pixel.
     pub finish_pixel_ns: f64,
@@ -101,7 +101,7 @@ pub struct Costs {
 /// A cluster of equal workers whose times are predicted ([`run`](crate::run)).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cluster {
-    /// Number of workers.
+    /// Number of workers in the cluster.
     pub workers: u32,
     /// Render threads of each worker, with a core each.
     pub threads: u32,
@@ -112,11 +112,11 @@ pub struct Cluster {
     /// Cores of the one machine on which everything runs in a rehearsal, where rendering takes time
     /// but no core. `None`: machines of their own; the master's has a core for each of its threads.
     pub shared_cores: Option<u32>,
-    /// Frames that the master has in hand at once.
+    /// Number of frames that the master has in hand at once.
     pub frames_in_flight: u32,
-    /// Factor on rendering times.
+    /// Factor on the model's rendering times; 1 leaves them.
     pub stretch: f64,
-    /// [`Config::mixed`].
+    /// Whether tiles of a frame may have two sizes, as [`Config::mixed`] says.
     pub mixed: bool,
 }
 
@@ -127,11 +127,12 @@ pub struct Master {
     pub link: Link,
     /// Processor time of messages and decisions.
     pub costs: Costs,
-    /// See [`Cluster::shared_cores`].
+    /// Number of cores of the one machine on which everything runs, as [`Cluster::shared_cores`]
+    /// says.
     pub shared_cores: Option<u32>,
-    /// Frames of a queued path that it has in hand at once.
+    /// Number of frames of a queued path that the master has in hand at once.
     pub frames_in_flight: u32,
-    /// Settings of the scheduler.
+    /// Settings of the scheduler that the master runs.
     pub scheduler: Config,
     /// Cuts bricks into messages of 1 to 16 bricks at random instead of full ones.
     pub random_batches: bool,
@@ -151,16 +152,16 @@ impl Default for Master {
     }
 }
 
-/// A virtual worker: its speed, memory and links, and the faults it has.
+/// Number of the worker's render threads, with a core each.
 #[derive(Clone, Debug)]
 pub struct WorkerProfile {
-    /// Render threads, with a core each.
+    /// Whether the worker runs on the master's host.
     pub threads: u32,
     /// Whether it runs on the master's host.
     pub is_local: bool,
-    /// Factor on the model's rendering times.
+    /// Factor on the model's rendering times; 1 leaves them.
     pub time_factor: f64,
-    /// Largest part by which a run takes longer, at random.
+    /// Largest share by which a run takes longer, at random; 0.1 = up to a tenth.
     pub time_jitter: f64,
     /// Nanoseconds that each run of a task takes besides drawing.
     pub run_overhead_ns: Nanos,
@@ -202,13 +203,13 @@ impl Default for WorkerProfile {
 /// Faults of a worker that happen at random or at a tile. A rate of 0 means never.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Faults {
-    /// One result in so many is sent twice.
+    /// Number n for which one result in n is sent twice; 0 = never.
     pub duplicate_one_in: u64,
-    /// One result, or handed-over piece, in so many is malformed.
+    /// Number n for which one result, or handed-over piece, in n is malformed; 0 = never.
     pub lie_one_in: u64,
-    /// One task in so many is refused.
+    /// Number n for which one task in n is refused; 0 = never.
     pub fail_one_in: u64,
-    /// One brick in so many arrives damaged.
+    /// Number n for which one brick in n arrives damaged; 0 = never.
     pub broken_one_in: u64,
     /// Upper left corner of tiles that kill the worker while it draws them.
     pub deadly_tile: Option<[i32; 2]>,

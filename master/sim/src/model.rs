@@ -28,18 +28,19 @@ pub struct TaskFacts {
 /// Time that a worker takes for a frame besides drawing its tiles, in nanoseconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct FrameSetup {
-    /// Tables, once a frame.
+    /// Nanoseconds to make the tables of a frame, once a frame.
     pub tables_ns: u64,
-    /// Look at the directory's blocks of bricks, once a frame of the `region` schedule.
+    /// Nanoseconds to look at the directory's blocks of bricks, once a frame of the `region`
+    /// schedule.
     pub directory_ns: u64,
-    /// Look at the bricks of one block, once a frame each.
+    /// Nanoseconds to look at the bricks of one block, once a frame for each block.
     pub block_ns: u64,
 }
 
-/// A finished task.
+/// Result of a finished task: pixels, voxel counts and bricks used.
 #[derive(Clone, Debug)]
 pub struct TaskOutput {
-    /// Its pixels.
+    /// Pixels of the task's tile.
     pub pixels: Pixels,
     /// Voxels that were tossed, splatted and culled.
     pub counters: Counters,
@@ -81,7 +82,7 @@ pub trait Region {
     fn upcoming(&self) -> Vec<u32>;
 }
 
-/// Costs and contents of tiles.
+/// Costs of tiles and the contents of their results: all that a simulation knows about pictures.
 pub trait TileModel {
     /// Progress of a region.
     type Region: Region;

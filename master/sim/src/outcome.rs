@@ -11,23 +11,24 @@ use slabcast_trace::Trace;
 /// Times and traffic of one frame. Moments are nanoseconds since the cluster began.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct FrameOutcome {
-    /// When the scheduler turned to it: when it was queued, or when the frame before was done.
+    /// Time at which the scheduler turned to the frame: when it was queued, or when the frame
+    /// before was done.
     pub began: Nanos,
-    /// When its last pixel arrived.
+    /// Time at which the frame's last pixel arrived at the master.
     pub done: Nanos,
-    /// When it was hashed and encoded.
+    /// Time at which the frame was hashed and encoded.
     pub delivered: Nanos,
-    /// Nanoseconds of drawing, summed over threads.
+    /// Nanoseconds of drawing the frame, summed over threads.
     pub render: Nanos,
-    /// Bytes from the master to workers, bricks not included.
+    /// Bytes sent from the master to workers, bricks not included.
     pub down: u64,
-    /// Bytes from workers to the master.
+    /// Bytes sent from workers to the master.
     pub up: u64,
-    /// Bytes of bricks.
+    /// Bytes of the bricks sent to workers.
     pub bricks: u64,
-    /// Number of leases.
+    /// Number of leases that were given.
     pub leases: u64,
-    /// Number of pieces that were handed over.
+    /// Number of pieces of tiles that idle workers took over.
     pub handed_over: u64,
     /// Number of messages from the master, bricks not included.
     pub messages_down: u64,
@@ -41,21 +42,21 @@ pub struct FrameOutcome {
 /// ([`Outcome::steady_frames`]): nanoseconds, summed over all threads. The parts make up the whole.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ThreadTime {
-    /// Drawing tiles.
+    /// Time of threads that draw tiles.
     pub tiles: Nanos,
-    /// Making a frame's tables and looking at its blocks of bricks.
+    /// Time of threads that make a frame's tables or look at its blocks of bricks.
     pub tables: Nanos,
-    /// Looking at the bricks of blocks that tiles opened.
+    /// Time of threads that look at the bricks of blocks that tiles opened.
     pub blocks: Nanos,
-    /// Reading and writing messages on a core that was drawing.
+    /// Time of reading and writing messages on a core that was drawing.
     pub messages: Nanos,
-    /// Idle: regions lack bricks.
+    /// Idle time of threads whose regions lack bricks.
     pub bricks: Nanos,
-    /// Idle: a result or a lease is under way, or the thread wakes.
+    /// Idle time while a result or a lease is under way, or the thread wakes.
     pub round_trip: Nanos,
-    /// Idle: the master knows, and has no task to lend.
+    /// Idle time while the master knows of it and has no task to lend.
     pub no_work: Nanos,
-    /// Idle, when all frames have begun: the end of the path.
+    /// Idle time when all frames have begun: the end of the path.
     pub path_end: Nanos,
 }
 
@@ -71,13 +72,13 @@ impl ThreadTime {
 /// Processor time of the master and of the workers besides rendering, in nanoseconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Work {
-    /// The master's driver.
+    /// Processor time of the master's driver.
     pub driver: Nanos,
-    /// The master's streams.
+    /// Processor time of the master's streams: reading and writing messages.
     pub streams: Nanos,
-    /// The master's finishers.
+    /// Processor time of the master's finishers: hashing and encoding frames.
     pub finishers: Nanos,
-    /// All workers, besides rendering.
+    /// Processor time of all workers for everything but rendering.
     pub workers: Nanos,
 }
 
@@ -241,7 +242,7 @@ pub trait Observer {
     }
 }
 
-/// An observer that ignores everything.
+/// An observer that ignores everything it is told.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct NoObserver;
 
@@ -280,7 +281,7 @@ impl<O: Observer + ?Sized> Observer for &mut O {
 pub struct Tally {
     /// Number of operations, or of the bricks or pixels they were about.
     pub count: u64,
-    /// Nanoseconds of all of them.
+    /// Nanoseconds of processor time, summed over all the operations.
     pub ns: Nanos,
 }
 
@@ -307,16 +308,16 @@ pub struct DecisionTimes {
     pub slabs: Tally,
     /// Pixels of the pictures whose slabs were begun.
     pub slab_pixels: u64,
-    /// Taking results that began nothing, by their pixels.
+    /// Taking results that began no frame or slab; counts their pixels.
     pub results: Tally,
-    /// Number of these results.
+    /// Number of results that began no frame or slab.
     pub result_count: u64,
-    /// Number of leases that were given with them.
+    /// Number of leases that were given when results were taken that began no frame or slab.
     pub lease_count: u64,
-    /// Pixels of these leases.
+    /// Number of pixels of the leases that `lease_count` counts.
     pub lease_pixels: u64,
-    /// Looks for bricks to prefetch.
+    /// Looking for bricks to prefetch; counts the looks.
     pub prefetches: Tally,
-    /// All other events.
+    /// Handling all other events; counts the events.
     pub others: Tally,
 }

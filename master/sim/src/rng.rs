@@ -1,6 +1,6 @@
 //! Random numbers from a seed, the same on every machine.
 
-/// The xorshift64* generator.
+/// A pseudo-random number generator, xorshift64*: the same numbers for the same seed.
 #[derive(Clone, Debug)]
 pub struct Rng(u64);
 

@@ -27,7 +27,7 @@ use tokio::sync::watch;
 /// Most jobs that a master remembers. Beyond it, the oldest jobs that are over are forgotten.
 pub const MAX_JOBS: usize = 1000;
 
-/// State of a job.
+/// State of a job, from its queue to its end.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum JobState {
     /// Other jobs come first.
@@ -56,11 +56,11 @@ impl JobState {
 /// A job as clients see it.
 #[derive(Clone, Debug)]
 pub struct JobView {
-    /// The job's id.
+    /// Id that the master gave the job.
     pub id: JobId,
     /// The key that the client chose for the request (`client_key`).
     pub client_key: String,
-    /// State of the job.
+    /// State that the job is in now.
     pub state: JobState,
     /// Number of frames that were finished at least once.
     pub frames_done: u64,
@@ -74,7 +74,7 @@ pub struct JobView {
     pub workers: u32,
     /// Width and height of the pictures, in pixels.
     pub size: [u32; 2],
-    /// Pixel format of the pictures.
+    /// Format of the pixels that the job delivers.
     pub format: PixelFormat,
     /// Time of submission, in milliseconds since 1970 UTC.
     pub submitted_unix_ms: i64,
@@ -87,9 +87,9 @@ pub struct JobView {
 pub struct FinishedFrame {
     /// Number of the frame in its job, from 0.
     pub number: u64,
-    /// Width and height in pixels.
+    /// Width and height of the frame in pixels.
     pub size: [u32; 2],
-    /// Pixel format of `bytes`.
+    /// Format of the pixels in `bytes`.
     pub format: PixelFormat,
     /// Pixels, row by row from the top left.
     pub bytes: Bytes,

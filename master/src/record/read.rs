@@ -33,7 +33,7 @@ const MAX_LINE_BYTES: u64 = 1 << 30;
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}: {problem}")]
 pub struct RecordError {
-    /// Line, counted from 1.
+    /// Number of the line in the record, counted from 1.
     pub line: u64,
     /// Problem of the line, and the remedy.
     pub problem: String,
@@ -42,20 +42,20 @@ pub struct RecordError {
 /// The first decision of a replay that differs from the record.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Difference {
-    /// Line of the decision, counted from 1.
+    /// Number of the decision's line in the record, counted from 1.
     pub line: u64,
-    /// Decision in the record.
+    /// Decision as the record has it, in words for people.
     pub recorded: String,
-    /// Decision of the scheduler that replays.
+    /// Decision of the scheduler that replays, in words for people.
     pub replayed: String,
 }
 
-/// Outcome of a replay.
+/// Outcome of replaying a record through a fresh scheduler.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ReplaySummary {
     /// Number of events that were handed to the scheduler.
     pub events: u64,
-    /// Number of decisions that agree.
+    /// Number of decisions that are the same as in the record.
     pub decisions: u64,
     /// Number of frames that were finished.
     pub frames: u64,

@@ -40,9 +40,9 @@ pub struct Recorder {
 /// Summary of a record that was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RecordSummary {
-    /// Number of events.
+    /// Number of events that the record holds.
     pub events: u64,
-    /// Number of decisions.
+    /// Number of decisions that the record holds.
     pub decisions: u64,
     /// Reason why the record ends early, if it does.
     pub cut: Option<String>,

@@ -23,13 +23,13 @@ pub enum OpenErrorKind {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{}", one_line(&format!("{field}: {what}; {remedy}")))]
 pub struct Problem {
-    /// Kind of failure.
+    /// Kind of failure, by which programs tell failures apart.
     pub kind: OpenErrorKind,
     /// Field of the file, in the words of its format (`content` where it has none).
     pub field: String,
-    /// What is wrong with the field, for a person.
+    /// Problem with the field, in words for people.
     pub what: String,
-    /// What the user can do about it.
+    /// Remedy that is open to the user, in words for people.
     pub remedy: String,
 }
 
@@ -39,7 +39,7 @@ pub struct Problem {
 pub struct OpenError {
     /// Path as the caller gave it.
     pub file: String,
-    /// The failure.
+    /// Kind of failure, field, what is wrong, and the remedy.
     pub problem: Problem,
 }
 

@@ -100,7 +100,7 @@ pub struct Hints {
 /// A volume and the reader's notes on how it was read.
 #[derive(Clone, Debug)]
 pub struct Opened {
-    /// The volume.
+    /// Volume that was read from the file.
     pub volume: Volume,
     /// Choices that the reader made, one sentence each, to show to the user.
     pub notes: Vec<String>,

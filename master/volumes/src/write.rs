@@ -9,7 +9,7 @@ use flate2::write::GzEncoder;
 use slabcast_common::volume::{Samples, ValueMap, Volume};
 use std::io::{self, Write};
 
-/// File format to write.
+/// File format in which a volume is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
     /// NRRD, header and data in one `.nrrd` file.

@@ -53,11 +53,11 @@ pub enum Connection<'a> {
 
 /// A cluster and the job that settings are tried with.
 pub struct ClusterRun<'a> {
-    /// Runtime that drives the connection.
+    /// Runtime that drives the connection to the master.
     pub runtime: &'a Runtime,
-    /// The master that renders.
+    /// Connection to the master that renders the trials.
     pub connection: Connection<'a>,
-    /// The volume, with its digest.
+    /// Lattice, values and digest of the master's volume.
     pub info: VolumeInfo,
     /// The request of the user; it must fit the volume.
     pub request: RenderRequest,

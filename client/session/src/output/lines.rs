@@ -118,7 +118,7 @@ impl Lines {
         matches!(self, Lines::Stdout { .. })
     }
 
-    /// Returns whether lines are wanted.
+    /// Returns whether the user wants lines at all, to any place.
     pub fn wanted(&self) -> bool {
         !matches!(self, Lines::None)
     }

@@ -33,14 +33,14 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use tokio::task::JoinSet;
 
-/// A finished frame.
+/// A finished frame of a path: its number and encoded pixels.
 #[derive(Clone, Debug)]
 pub struct Frame {
     /// Number of the frame on its whole path.
     pub number: u64,
-    /// Width and height in pixels.
+    /// Width and height of the frame in pixels.
     pub size: [u32; 2],
-    /// Pixel format of `bytes`.
+    /// Format of the pixels in `bytes`.
     pub format: PixelFormat,
     /// Pixels, row-major from the top left, in `format`.
     pub bytes: bytes::Bytes,
@@ -77,7 +77,7 @@ impl Frame {
     }
 }
 
-/// File format of frames.
+/// File format in which frames are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Format {
@@ -167,7 +167,7 @@ enum Target {
 #[derive(Debug)]
 pub struct Output {
     target: Target,
-    /// Format of the files.
+    /// File format in which frames are written.
     pub format: Format,
     fps: u16,
     contact: Option<PathBuf>,

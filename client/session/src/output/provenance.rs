@@ -30,26 +30,27 @@ const MAX_BYTES: u64 = 2 << 30;
 pub struct Provenance {
     /// Format version, 1.
     version: u32,
-    /// Version of the program.
+    /// Version of the program that made the picture.
     pub slabcast: String,
     /// Version of the pixels that the program drew (`PIXELS_VERSION`).
     pub pixels_version: u32,
-    /// Digest of the volume.
+    /// SHA-256 digest of the volume, in hexadecimal.
     pub volume_sha256: String,
     /// The view, or the whole path of a moving picture.
     pub path: ViewPath,
     /// Preset that the transfer function came from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub preset: Option<String>,
-    /// Transfer function, presets resolved.
+    /// Transfer function of the picture, a preset already fitted to the volume.
     pub transfer: TransferFunction,
-    /// Quality, sums decided.
+    /// Quality of the picture, with the number type of sums that was used.
     pub quality: Quality,
-    /// Factor by which the picture is larger than the path's size, at which it was drawn.
+    /// Factor by which the picture's width and height were enlarged after it was drawn; 1 = not at
+    /// all.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub magnify: u32,
     background: Ground,
-    /// Format of the file.
+    /// File format of the picture.
     pub format: Format,
     /// Frames a second of a moving picture.
     #[serde(default, skip_serializing_if = "Option::is_none")]

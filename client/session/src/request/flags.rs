@@ -318,7 +318,7 @@ impl VolumeSceneArgs {
 
 /// A volume that fits a request.
 pub struct OpenedVolume {
-    /// The volume with its voxels.
+    /// Volume that was opened, with its voxels.
     pub volume: Volume,
     /// Lattice, value range and SHA-256 digest of the opened volume.
     pub info: VolumeInfo,

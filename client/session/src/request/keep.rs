@@ -30,7 +30,7 @@ enum Kept {
 }
 
 impl KeepArgs {
-    /// Returns what is kept.
+    /// Returns the data to keep although the scene does not need them.
     pub fn keep(&self) -> Keep {
         let has = |kept| self.keep.contains(&kept);
         Keep {

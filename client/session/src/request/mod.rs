@@ -35,17 +35,18 @@ pub struct RenderRequest {
     pub path_file: Option<PathBuf>,
     /// Axes that were given, if a side of the body was asked for.
     side: Option<AxisArgs>,
-    /// Colours and opacities.
+    /// Colours and opacities that the user chose: a preset, a map or a file.
     pub transfer: Transfer,
-    /// What decides the pixels.
+    /// Quality of the pictures: all that changes pixels beside volume, views and colours.
     pub quality: Quality,
-    /// What the quality is to be chosen by, if it is.
+    /// Error or time that the quality is to be chosen by; empty if the user gave none.
     pub target: QualityTarget,
-    /// Factor by which pictures are magnified; the path's size is what is drawn.
+    /// Factor by which the width and height of drawn pictures are enlarged; 1 = not at all.
+    /// Pictures are drawn at the path's size.
     pub magnify: u32,
     /// How the work is cut; never changes a pixel.
     pub work: Work,
-    /// What lies behind transparent pixels.
+    /// Background that the volume is composited over.
     pub background: Background,
     /// Whether statistics carry the hash of the linear picture.
     pub hashed: bool,

@@ -25,13 +25,14 @@ pub const LEVELS: usize = 5;
 /// A tile of the level that was chosen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Macrotile {
-    /// Its pixels, clipped to the picture.
+    /// Rectangle of the tile's pixels, clipped to the picture.
     pub rect: Rect,
-    /// Open pixels under needed bricks.
+    /// Workload of the tile: number of its open pixels that lie under a needed brick (paper section
+    /// 4.3).
     pub est: u64,
 }
 
-/// How one slab is cut.
+/// Cut of one slab into macrotiles (paper section 4.3).
 #[derive(Clone, Debug, Default)]
 pub struct Cut {
     /// Edge of the level's tiles in pixels; of a mixed cut, of the smaller ones.

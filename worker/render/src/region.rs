@@ -147,13 +147,13 @@ pub struct Region {
     depths: Vec<(Rect, Cells)>,
 }
 
-/// The result of a region.
+/// Result of a region that is drawn through all depths.
 #[derive(Debug)]
 pub struct FinishedRegion {
     /// Opacity and light of each pixel of the tile, row-major; without the sums of a last sheet,
     /// since nothing is drawn behind them.
     pub pixels: TilePixels,
-    /// Voxels splatted and culled.
+    /// Numbers of voxels that were tossed, drawn and culled.
     pub counters: Counters,
     /// Directory indices of the bricks that were drawn, ascending, without repetition.
     pub touched: Vec<u32>,

@@ -78,12 +78,14 @@ const SLIVERS_PER_EPS: f64 = 5.0;
 /// takes positions, payloads and the rule of compositing from here.
 #[derive(Debug)]
 pub struct Frame {
-    /// The scene that is viewed.
+    /// Scene that is viewed: appearance of samples, quality and size.
     pub scene: Arc<Scene>,
-    /// Camera, picture size and sheets.
+    /// Camera, picture size in pixels and sheet thickness.
     pub view: View,
+    /// Weights of a voxel's sections by depth phase (paper section 3).
     #[doc(hidden)]
     pub sections: Arc<Sections>,
+    /// Footprints of the view, one scale or one for each sheet.
     #[doc(hidden)]
     pub footprints: Footprints,
     pub(crate) rule: Rule,
@@ -127,9 +129,10 @@ pub struct Corner {
     /// Index position of its first voxel.
     #[doc(hidden)]
     pub index: [u32; 3],
-    /// Eye coordinates in vox.
+    /// Eye coordinates of the brick's first voxel, in vox.
     pub eye: DVec3,
-    /// Integer position, in orthographic views.
+    /// Integer position of the brick's first voxel (2^-24 subpixel, 2^-24 phase); used in
+    /// orthographic views alone.
     #[doc(hidden)]
     pub flat: FlatCorner,
 }
@@ -137,7 +140,7 @@ pub struct Corner {
 /// Position of a voxel in a frame.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Placed {
-    /// Eye coordinates in vox.
+    /// Eye coordinates of the voxel, in vox.
     pub eye: DVec3,
     /// Depth in phases of a sheet ([`View::depth_phases`]).
     pub z: i32,
@@ -154,7 +157,7 @@ impl Frame {
         Frame { rule: self.rule.never_shut(), ..self }
     }
 
-    /// Prepares `view` of `scene`.
+    /// Prepares `view` of `scene` for any number of render threads.
     pub fn new(scene: Arc<Scene>, view: View) -> Self {
         let q = &scene.quality;
         let whole = TightBox { lo: [0; 3], hi: scene.dims.map(|n| n - 1) };

@@ -51,6 +51,7 @@ use std::sync::Arc;
 #[derive(Default)]
 pub struct Scratch {
     general: GeneralScratch,
+    /// Memory of the fast geometries, for each number type of sums.
     #[doc(hidden)]
     pub whole: Whole,
     pixels: Pixels,
@@ -65,8 +66,11 @@ pub struct Scratch {
 #[doc(hidden)]
 #[derive(Default)]
 pub struct Whole {
+    /// Memory for 16-bit sums in colour.
     pub shorts: Store<i16>,
+    /// Memory for 32-bit sums in colour.
     pub longs: Store<i32>,
+    /// Memory for 32-bit sums of scenes whose three colours are one.
     pub greys: Store<Grey>,
     waiting: Waiting,
 }

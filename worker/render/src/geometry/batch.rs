@@ -14,7 +14,7 @@ use crate::scene::Frame;
 use crate::visibility::open_mask::OpenMask;
 use slabcast_common::message::Counters;
 
-/// Voxels of one bucket, and where their sections lie.
+/// Up to 64 voxels of one bucket with their samples and normals, and the places of their sections.
 pub struct Batch {
     pub(crate) samples: Each<u32>,
     pub(crate) normals: Each<u16>,
@@ -36,14 +36,16 @@ impl Default for Batch {
     }
 }
 
-/// Footprints by slot: their weights, and where those across and down lie.
+/// Footprints by slot of an open sheet: their weights, and the layouts of those across and down.
 pub struct Axes<'a, S: Recorded, const N: usize> {
+    /// Weight tables by slot: across, down and in depth.
     pub layers: Layers<'a, S, N>,
+    /// Layouts of the weight tables by axis (across, down) and slot.
     pub phases: [[Phases; N]; 2],
 }
 
 impl<'a, S: Recorded, const N: usize> Axes<'a, S, N> {
-    /// With one footprint in all slots, for voxels that begin in sheet `k`.
+    /// Puts one footprint into all slots, for voxels that begin in sheet `k`.
     #[inline(always)]
     pub fn new(frame: &'a Frame, k: i32, footprint: &Footprint<'a>) -> Self {
         let [(x, phases_x), (y, phases_y)] = [along::<S>(footprint, 0), along::<S>(footprint, 1)];

@@ -17,9 +17,11 @@ use crate::visibility::open_mask::{OpenMask, doubling};
 use slabcast_common::message::Counters;
 use slabcast_common::view::Projection;
 
+/// Edge of a part in pixels, as an index.
 pub const EDGE: usize = PART as usize;
 
-/// Memory for sums of one kind.
+/// Memory of a render thread for the sums of one number type: records, tiers, and sums of closed
+/// sheets.
 pub struct Store<S: Recorded> {
     /// Records of any number of sheets; nothing in them between parts.
     lines: Vec<Line>,
@@ -50,7 +52,7 @@ impl<S: Recorded> SharedRowsStore<S> {
     }
 }
 
-/// Memory for sheets that are closed, and what is known of the one before.
+/// Memory for sheets that close: the sums of the sheet in front and the places of closing pixels.
 pub struct Closes<S: Recorded> {
     /// Sums of the sheet before, where it was touched; elsewhere anything.
     before: Vec<S::Pixel>,
@@ -69,7 +71,7 @@ impl<S: Recorded> Default for Store<S> {
 }
 
 impl<S: Recorded> Store<S> {
-    /// Whether there are no sums of any part, and whether there are tiers at all.
+    /// Returns whether no sums are left of any part, and whether there are tiers at all.
     pub fn is_empty(&mut self) -> (bool, bool) {
         let SharedRowsStore { tiers, shape: (shape, sheets), .. } = &mut self.level;
         let empty = match *sheets {
@@ -128,8 +130,9 @@ impl<V: Copy> Bucket<V> {
     }
 }
 
-/// Voxels that wait.
+/// Voxels of a part that wait for the sheets at which they begin.
 pub struct Queues<V> {
+    /// Waiting voxels by their first sheet, counted from the slab's first.
     pub buckets: Vec<Bucket<V>>,
     /// Voxels that begin before the slab, and where.
     pub(crate) carried: Vec<(V, i32)>,
@@ -187,7 +190,8 @@ pub struct Due<'a, V> {
     before: &'a [(V, i32)],
 }
 
-/// Some that are due, of one kind.
+/// Some of the voxels that are due at a sheet, all of one kind: they begin there, or before the
+/// slab.
 pub enum Chunk<'a, V> {
     Here(&'a [V]),
     Before(&'a [(V, i32)]),
@@ -307,7 +311,7 @@ pub fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
     sheets.empty(k);
 }
 
-/// Pixels of a part, a bit each, row by row.
+/// Pixels of a part, one bit each: bit x of word y is column x of row y.
 pub type Rows = [u64; EDGE];
 
 /// When to look for touched pixels that nothing reached. In 16-bit sums a footprint's corners and
@@ -342,7 +346,7 @@ impl Sifting {
     }
 }
 
-/// Closes the pixels of a sheet that are beside each other.
+/// Closes the pixels of a sheet whose sums `folded` has side by side.
 #[inline(always)]
 pub fn close_folded<S: Recorded>(
     simd: Simd,
@@ -421,7 +425,7 @@ impl<S: Recorded> Closes<S> {
     }
 }
 
-/// The open sheets of a part, in records.
+/// Open sheets of a part whose sums are kept in one record a pixel.
 pub struct Sheets<'a, S: Recorded, const N: usize> {
     pub(crate) simd: Simd,
     pub(crate) records: &'a mut [Record<S, N>],
@@ -434,6 +438,7 @@ pub struct Sheets<'a, S: Recorded, const N: usize> {
     most: usize,
 }
 
+/// Returns the slot, 0 to N - 1, in which records of `N` sheets keep sheet `k`.
 #[inline(always)]
 pub fn slot<const N: usize>(k: i32) -> usize {
     k as usize % N
@@ -478,7 +483,7 @@ impl<S: Recorded, const N: usize> Open<S> for Sheets<'_, S, N> {
 }
 
 impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
-    /// In memory of `store`, for voxels that touch `most` sheets at most.
+    /// Takes `store` as memory, for voxels that touch at most `most` sheets.
     pub fn new(simd: Simd, store: &'a mut Store<S>, most: usize) -> Self {
         let Store { lines: all, closes, .. } = store;
         let lines = STRIDE * EDGE * size_of::<Record<S, N>>() / size_of::<Line>();
@@ -496,8 +501,8 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
         }
     }
 
-    /// Notes that voxels that begin at sheet `k` touch so many columns and rows from where
-    /// `corners` has bits.
+    /// Notes the pixels that voxels touch which begin at sheet `k`: `wide` columns and `high` rows
+    /// from each pixel whose bit is set in `corners`.
     #[inline(always)]
     pub fn touch_all(&mut self, k: i32, corners: &Rows, [wide, high]: [usize; 2]) {
         let added = &mut self.added[slot::<N>(k)];
@@ -519,7 +524,7 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
         }
     }
 
-    /// Pixels that voxels which begin at sheets `from` to `k` touch.
+    /// Returns the pixels that voxels touch which begin at sheets `from` to `k`.
     #[inline(always)]
     pub fn touched(&self, from: i32, k: i32) -> Rows {
         let mut rows = [0; EDGE];

@@ -73,12 +73,13 @@ impl Default for Places {
     }
 }
 
-/// What drawing a part of a perspective view takes.
+/// Constants for drawing one part of a perspective view: focal length, distance and reach.
 #[derive(Clone, Copy, Debug)]
 pub struct Deep {
     focal: f64,
     distance: f64,
-    /// Pixels along x and y from the one that holds a centre within which all sections stay.
+    /// Number of pixels along x and y between the one that holds a voxel's centre and the edge of
+    /// its farthest section.
     pub reach: [i32; 2],
 }
 

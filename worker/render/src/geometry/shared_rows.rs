@@ -307,7 +307,7 @@ impl Hull {
     }
 }
 
-/// Which columns are open in any of some rows that follow each other.
+/// Answers which columns of a part are open in any row of a run of rows.
 pub struct AnyOpen {
     /// Of the `i`th power of two of rows, from each on.
     rows: [Rows; AnyOpen::POWERS],
@@ -316,7 +316,7 @@ pub struct AnyOpen {
 impl AnyOpen {
     const POWERS: usize = EDGE.ilog2() as usize + 1;
 
-    /// For at most so many rows.
+    /// Prepares answers for runs of at most `most` rows; `open` has a bit for each open pixel.
     #[inline(always)]
     pub fn new(open: &Rows, most: usize) -> AnyOpen {
         let mut rows = [[0; EDGE]; AnyOpen::POWERS];
@@ -331,7 +331,8 @@ impl AnyOpen {
         AnyOpen { rows }
     }
 
-    /// Of the rows from `begin` to the one before `end`, where the part has any.
+    /// Returns the columns, a bit each, that are open in any row from `begin` up to but without
+    /// `end`; rows outside the part are left out.
     #[inline(always)]
     pub fn of(&self, begin: i32, end: i32) -> u64 {
         let [begin, end] = [begin.max(0), end.min(PART)];
@@ -457,7 +458,8 @@ impl<S: Tiered, const N: usize> SharedRowsSheets<'_, S, N> {
     }
 }
 
-/// Draws a part of an orthographic view, as work that is compiled once for each instruction set.
+/// Work that draws one part of an orthographic view with a level camera into row records; it is
+/// compiled once for each instruction set.
 pub struct RenderSharedRows<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
     pub(crate) view: SharedRowsView<'a>,

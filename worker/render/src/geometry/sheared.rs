@@ -29,14 +29,17 @@ pub(crate) struct Waiting {
     batch: Box<Batch>,
 }
 
-/// What drawing parts of a view with a leaning kernel takes.
+/// Constants for drawing parts of a view whose kernel leans: integer positions and the offsets of
+/// sections.
 #[derive(Clone, Copy)]
 pub struct Lean<'a> {
+    /// Integer positions of voxels in the view, and the reach of their footprints.
     pub flat: &'a Flat,
     leaning: &'a Leaning,
 }
 
-/// Returns what drawing parts of `frame` here takes, if they may be drawn here.
+/// Returns the constants for drawing parts of `frame` with a leaning kernel; `None` if the view
+/// needs another way.
 pub fn accepts(frame: &Frame) -> Option<Lean<'_>> {
     let (flat, leaning) = (frame.flat.as_ref()?, frame.leaning.as_ref()?);
     let fits = flat.reach.iter().all(|reach| 2 * reach + 2 < WINDOW as i32);

@@ -24,6 +24,7 @@ const ULP: f64 = 1.0 / 16_777_216.0;
 #[derive(Clone, Copy, Debug)]
 pub struct Profile {
     std: f64,
+    /// Support radius of the kernel in vox.
     #[doc(hidden)]
     pub radius: f64,
     norm: f64,
@@ -117,16 +118,16 @@ impl Profile {
 /// The appearance of all voxels of one layer.
 #[derive(Clone, Copy, Debug)]
 pub struct Layer {
-    /// Extinction per vox.
+    /// Extinction of the layer's voxels, per vox.
     pub sigma: f64,
-    /// Linear RGB, 0 to 1.
+    /// Linear red, green and blue of the layer's voxels, 0 to 1.
     pub rgb: [f64; 3],
 }
 
 /// Layers of voxels one vox apart, seen along the layers' axis in an orthographic view.
 #[derive(Clone, Debug)]
 pub struct LayerStack {
-    /// The kernel, the same along all axes.
+    /// Kernel of every voxel, with one profile along all axes.
     pub profile: Profile,
     /// Lattice points of each layer along the picture's two axes.
     pub across: [Range<i32>; 2],
@@ -135,12 +136,12 @@ pub struct LayerStack {
 }
 
 impl LayerStack {
-    /// The product of the two sums across at index position (u, v).
+    /// Returns the unitless product of the kernel sums along x and y at index position (u, v).
     pub fn lateral(&self, [u, v]: [f64; 2]) -> f64 {
         self.profile.sum(u, &self.across[0]) * self.profile.sum(v, &self.across[1])
     }
 
-    /// Depth of layer `j`.
+    /// Returns the depth of layer number `j` in vox behind the target.
     pub fn z(&self, j: usize) -> f64 {
         j as f64 - (self.layers.len() as f64 - 1.0) / 2.0
     }
@@ -309,23 +310,25 @@ impl Rounding {
 /// Voxels whose extinction is a Gaussian about the volume's centre.
 #[derive(Clone, Copy, Debug)]
 pub struct GaussianBlob {
-    /// The kernel, the same along all axes.
+    /// Kernel of every voxel, with one profile along all axes.
     pub profile: Profile,
     /// Extinction at the peak, per vox.
     pub peak: f64,
-    /// Deviation of the blob in vox.
+    /// Standard deviation of the blob in vox.
     pub std: f64,
     /// Number of voxels along each axis.
     pub voxels: u32,
 }
 
 impl GaussianBlob {
+    /// Returns the blob's unitless profile (1 at the centre) `u` vox from the centre along one
+    /// axis.
     #[doc(hidden)]
     pub fn density(&self, u: f64) -> f64 {
         libm::exp(-u * u / (2.0 * self.std * self.std))
     }
 
-    /// Lattice points from the centre, along one axis.
+    /// Returns the positions of lattice points along one axis, in vox from the blob's centre.
     pub fn places(&self) -> impl Iterator<Item = f64> + use<> {
         let n = self.voxels;
         (0..n).map(move |i| f64::from(i) - (f64::from(n) - 1.0) / 2.0)

@@ -35,7 +35,7 @@ pub struct PixelExplanation {
     pub hidden_bricks: usize,
 }
 
-/// One sheet at one pixel.
+/// Account of one sheet at one pixel: its sums and what they add.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SheetAtPixel {
     /// Number of the sheet, which lies between `k` and `k + 1` thicknesses behind the target.
@@ -68,15 +68,15 @@ pub struct SheetAtPixel {
 pub struct SectionAtPixel {
     /// Index of the voxel in the volume.
     pub voxel: [u32; 3],
-    /// Brick of the voxel.
+    /// Number of the brick that holds the voxel.
     pub brick: BrickId,
     /// Sample code of the voxel, before the map from codes to values.
     pub code: f64,
-    /// Weights of the footprint along x and y, and of the section in depth.
+    /// Weights of the voxel, unitless: of the footprint along x and y, and of the section in depth.
     pub weights: [f32; 3],
     /// Optical depth that the voxel adds along the ray.
     pub tau: f32,
-    /// Linear RGB of the voxel, lit.
+    /// Linear red, green and blue of the voxel after shading, 0 to 1.
     pub colour: [f32; 3],
 }
 

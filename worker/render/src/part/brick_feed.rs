@@ -62,6 +62,7 @@ impl<T> Default for AppendList<T> {
 
 #[expect(clippy::len_without_is_empty, reason = "callers only index it")]
 impl<T> AppendList<T> {
+    /// Returns the number of items in the list.
     pub fn len(&self) -> usize {
         self.len.get()
     }
@@ -72,6 +73,7 @@ impl<T> AppendList<T> {
         (chunk, i + CHUNK - (CHUNK << chunk))
     }
 
+    /// Appends an item; items that are borrowed stay where they are.
     pub fn push(&self, item: T) {
         let (chunk, slot) = Self::locate(self.len.replace(self.len.get() + 1));
         let chunk = self.chunks[chunk]
@@ -79,16 +81,19 @@ impl<T> AppendList<T> {
         chunk[slot].get_or_init(|| item);
     }
 
+    /// Returns item number `i`, from 0.
     pub fn get(&self, i: usize) -> &T {
         let (chunk, slot) = Self::locate(i);
         let chunk = self.chunks[chunk].get();
         chunk.and_then(|c| c[slot].get()).expect("an index below the length")
     }
 
+    /// Returns the items in the order in which they were appended.
     pub fn iter(&self) -> impl Iterator<Item = &T> {
         (0..self.len()).map(|i| self.get(i))
     }
 
+    /// Removes all items and keeps their memory.
     pub fn clear(&mut self) {
         let used = self.chunks.iter_mut().filter_map(OnceCell::get_mut).flatten();
         used.take(self.len.replace(0)).for_each(|item| *item = OnceCell::new());

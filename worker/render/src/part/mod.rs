@@ -19,9 +19,9 @@ use std::sync::Arc;
 /// A brick projected into a frame, once for all tiles.
 #[derive(Clone, Debug)]
 pub struct ProjectedBrick {
-    /// The brick.
+    /// Brick with the voxels to draw.
     pub brick: Arc<Brick>,
-    /// Pixels and sheets that its voxels may touch.
+    /// Rectangle of pixels and run of sheets that the brick's voxels may touch.
     pub projected: Projected,
     pub(crate) corner: Corner,
 }
@@ -49,7 +49,7 @@ impl ProjectedBrick {
 /// The pixels of the tile that a part belongs to, read and written, and its voxel counts.
 pub type Io<'a> = (&'a mut TilePixels, &'a mut Counters);
 
-/// Source of a part's bricks.
+/// Source that a part's bricks are drawn from.
 #[derive(Clone, Copy)]
 pub enum BrickSource<'a> {
     /// All bricks of the tile are held.

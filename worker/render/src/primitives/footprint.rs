@@ -85,8 +85,8 @@ fn kept(profile: &Profile, thickness: f64, phases: i32) -> Option<(i32, i32)> {
 }
 
 impl Sections {
-    /// For sheets of `thickness` and a kernel profile along z, both in vox; `merged`: with slivers
-    /// given to their neighbours.
+    /// Integrates a kernel's profile along the view axis over sheets of `thickness`, both in vox,
+    /// at `phases` depths a sheet. `merged` gives slivers to the sheets beside them.
     pub fn new(profile: &Profile, thickness: f64, phases: i32, merged: bool) -> Self {
         let radius = whole_phases(profile, thickness, phases);
         let (front, back) = match kept(profile, thickness, phases) {
@@ -116,10 +116,10 @@ impl Sections {
         sections
     }
 
-    /// How much of a pixel's light may change its sheet where slivers are given away, at most, by
-    /// voxels of extinction up to `most` per vox: 0 to 1. In front that is a sliver's opacity;
-    /// behind, what shows of it through its voxel, `t exp(-t)` of the sliver for an optical depth t
-    /// of the voxel.
+    /// Returns the largest share of a pixel's light, 0 to 1, that may change its sheet where
+    /// slivers are given away, for voxels of extinction up to `most` per vox. In front that is a
+    /// sliver's opacity; behind, what shows of it through its voxel, `t exp(-t)` of the sliver for
+    /// an optical depth t of the voxel.
     pub fn given_away(profile: &Profile, thickness: f64, phases: i32, most: f64) -> f64 {
         let Some((front, back)) = kept(profile, thickness, phases) else { return 0.0 };
         let beyond = |reach: i32| {
@@ -129,15 +129,16 @@ impl Sections {
         (beyond(front) * most).max(beyond(back) * shows)
     }
 
-    /// First sheet of a voxel at depth `z` (in phases) and its weights in the sheets from there.
+    /// Returns the first sheet of a voxel at depth `z` (in phases), and the voxel's weights (shares
+    /// of its kernel, 0 to 1) in the sheets from there.
     #[inline]
     pub fn of(&self, z: i32) -> (i32, &[f32]) {
         let (row, count) = self.row(z);
         (self.first(z), &self.weights[row..row + count])
     }
 
-    /// [`Sections::of`] with weights over the thickness, in steps of the lattice, in units of
-    /// 2^-15.
+    /// Returns [`Sections::of`] in fixed point: weights over the thickness, in steps of the
+    /// lattice, in units of 2^-15.
     #[inline]
     pub fn of_fixed(&self, z: i32) -> (i32, &[i16]) {
         let (row, count) = self.row(z);
@@ -150,7 +151,8 @@ impl Sections {
         ((z & (self.phases - 1)) as usize * self.stride, self.span(z).1 as usize)
     }
 
-    /// First sheet of a voxel at depth `z` (in phases), and in how many it lies.
+    /// Returns the first sheet of a voxel at depth `z` (in phases), and the number of sheets that
+    /// it lies in.
     #[inline(always)]
     pub fn span(&self, z: i32) -> (i32, u32) {
         let first = self.first(z);
@@ -164,20 +166,22 @@ impl Sections {
         (self.front, self.back, self.shift)
     }
 
-    /// First sheet of a voxel at depth `z` (in phases).
+    /// Returns the number of the first sheet of a voxel at depth `z` (in phases).
     #[inline(always)]
     pub fn first(&self, z: i32) -> i32 {
         (z - self.front) >> self.shift
     }
 
-    /// Weights of [`Sections::of`] by phase, [`Sections::most`] a phase, those that a phase does
-    /// not need zero.
+    /// Returns the weights of [`Sections::of`] (shares, 0 to 1) of all depth phases, one phase
+    /// after the other, [`Sections::most`] weights each. Weights that a phase does not need are
+    /// zero.
     pub fn all(&self) -> &[f32] {
         &self.weights
     }
 
-    /// Weights of [`Sections::of_fixed`] by phase, [`Sections::most`] a phase, those that a phase
-    /// does not need zero.
+    /// Returns the weights of [`Sections::of_fixed`] (units of 2^-15) of all depth phases, one
+    /// phase after the other, [`Sections::most`] weights each. Weights that a phase does not need
+    /// are zero.
     pub fn all_fixed(&self) -> &[i16] {
         &self.fixed
     }
@@ -188,7 +192,7 @@ impl Sections {
         self.phases
     }
 
-    /// Most sheets that one voxel touches.
+    /// Returns the largest number of sheets that one voxel touches.
     pub fn most(&self) -> usize {
         self.stride
     }
@@ -198,11 +202,13 @@ impl Sections {
 #[derive(Clone, Copy, Debug)]
 #[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))] // Some of it is read in lanes alone.
 pub struct Slant<'a> {
-    /// `Leaning::subpixels`.
+    /// Offsets of a voxel's sections along x and y, in subpixels: for each depth phase as many as
+    /// weights.
     pub subpixels: [&'a [i32]; 2],
     /// Where weights across and down lie.
     pub(crate) phases: [Phases; 2],
-    /// `Leaning::row`: less than 2^20 either way.
+    /// Slope of x over y of the sheared kernel in units of 2^-16 ([`Lean::row_fixed`]): less than
+    /// 2^20 either way.
     pub row: i32,
     /// Whether sections or rows have columns of their own.
     pub skewed: bool,
@@ -295,8 +301,8 @@ impl Leaning {
         &self.subpixels[axis]
     }
 
-    /// How sections of voxels lie aside of each other, if they have no more rows and columns than
-    /// are added so.
+    /// Returns the offsets of voxels' sections from each other; `None` if sections spread over more
+    /// rows or columns than are added at once.
     pub fn slant(&self, phases: [Phases; 2]) -> Option<Slant<'_>> {
         let [x, down] = &phases;
         let skewed = self.row != 0;
@@ -407,7 +413,7 @@ impl First {
 #[derive(Clone, Copy, Debug)]
 pub struct Phases {
     first: First,
-    /// Pixels of one at most.
+    /// Largest number of pixels that a footprint has along the axis.
     pub len: usize,
     /// Zeros before and after the weights of each.
     margin: usize,
@@ -420,7 +426,7 @@ impl Phases {
         self.first.of(p)
     }
 
-    /// First pixel of a footprint at a place in subpixels.
+    /// Returns the first pixel of a footprint at `place`, in subpixels; both count from one corner.
     #[inline(always)]
     pub fn first_at(&self, place: i32) -> i32 {
         (place >> SUBPIXEL_BITS) + self.first(place & (SUBPIXELS - 1))
@@ -432,7 +438,7 @@ impl Phases {
         self.first.more_from
     }
 
-    /// Where the weights of phase `p` begin.
+    /// Returns the index in the table at which the weights of phase `p` begin.
     #[inline(always)]
     pub fn begin(&self, p: usize) -> usize {
         p * (self.len + 2 * self.margin) + self.margin
@@ -519,11 +525,12 @@ pub struct Footprints {
     shelf: Arc<Shelf>,
 }
 
-/// Tables by scale, and sections, that frames of one scene share, which has one kernel: along a
-/// turn a sheet's scale is the same in all, and so is the kernel's depth in a cubic lattice.
+/// Tables that all frames of one scene share. A scene has one kernel: along a turn a sheet's scale
+/// is the same in all frames, and so is the kernel's depth in a cubic lattice.
 #[derive(Debug, Default)]
 pub struct Shelf {
     tables: Mutex<BTreeMap<Key, Arc<Tables>>>,
+    /// Sections by profile, thickness and phases, kept from frame to frame.
     pub sections: Mutex<BTreeMap<Deep, Arc<Sections>>>,
     profiles: Mutex<BTreeMap<Cut, Arc<ProfileTable>>>,
 }
@@ -559,8 +566,8 @@ impl Shelf {
         shelved(&self.tables, SHELF, key, || Tables::new(x, y, scale, zeros))
     }
 
-    /// [`Sections::new`], made once: it takes 80 us, which is a twentieth of what a worker of
-    /// fifteen draws of a frame of mri256.
+    /// Returns [`Sections::new`] from the shelf, made once: it takes 80 us, which is a twentieth of
+    /// what a worker of fifteen draws of a frame of mri256.
     pub fn sections(
         &self,
         profile: &Profile,
@@ -604,17 +611,17 @@ fn shelved<K: Ord, V>(
     shelf.entry(key).or_insert(made).clone()
 }
 
-/// Sections that a shelf keeps, and profiles, of some 8 KB each. A view of a lattice that is not
-/// cubic has its own, and none of them is asked for again.
+/// Number of sections, and of profiles, that a shelf keeps, of some 8 KB each. A view of a lattice
+/// that is not cubic has its own, and none of them is asked for again.
 pub const SECTIONS: usize = 64;
 
 /// Weights along one axis, inside a clip: the first pixel and one weight a pixel.
 pub type Span<'a> = (i32, &'a [Tap]);
 
 impl Footprints {
-    /// The footprints of `view` with `kernel` for sheets in `range`; `spread` is the length of a
-    /// lattice step along the eye's axes in vox ([`Profile::with_spread`]). Tables are taken from
-    /// `shelf`.
+    /// Prepares the footprints of `view` with `kernel` for sheets in `range`; `spread` is the
+    /// length of a lattice step along the eye's axes in vox ([`Profile::with_spread`]). Tables are
+    /// taken from `shelf`.
     pub fn new(
         view: &View,
         kernel: Kernel,
@@ -646,7 +653,7 @@ impl Footprints {
         self.last
     }
 
-    /// The footprints of sheet `k`; `None` where the near plane clips it.
+    /// Returns the footprint of voxels in sheet `k`; `None` where the near plane clips the sheet.
     #[inline]
     pub fn at(&self, k: i32) -> Option<Footprint<'_>> {
         let scale = self.view.scale_at(k)?;
@@ -664,10 +671,10 @@ impl Footprints {
     }
 }
 
-/// The footprints of one sheet.
+/// Footprint of the voxels of one sheet: weights by position between pixels, along x and y.
 #[derive(Clone, Copy, Debug)]
 pub struct Footprint<'a> {
-    /// Pixels a vox, which says where it lies.
+    /// Pixels a vox in the sheet, from which positions follow.
     pub scale: f64,
     /// Scale rounded to a table's, which decides the footprint's width.
     wide: f64,
@@ -676,8 +683,9 @@ pub struct Footprint<'a> {
 }
 
 impl<'a> Footprint<'a> {
-    /// Pixels along x and y that it reaches at most from the one that holds its centre, where its
-    /// weights are in a table; otherwise they are worked out where they are drawn.
+    /// Returns the number of pixels along x and y between the one that holds a voxel's centre and
+    /// the edge of its footprint; `None` where weights are in no table and are worked out as they
+    /// are drawn.
     #[inline]
     pub fn reach(&self) -> Option<[i32; 2]> {
         self.table.map(|t| [t.along(0).reach, t.along(1).reach])
@@ -688,8 +696,8 @@ impl<'a> Footprint<'a> {
         self.profiles[axis].spread
     }
 
-    /// Pixels `[first, end)` along `axis` (0: x, 1: y) that a footprint at screen position
-    /// `pos` (1/256 pixel) covers.
+    /// Returns the pixels `[first, end)` along `axis` (0: x, 1: y) that a footprint covers at
+    /// screen position `pos`, in 1/256 pixel.
     #[inline]
     pub fn extent(&self, axis: usize, pos: i64) -> (i32, i32) {
         let (base, p) = split(pos);
@@ -706,8 +714,8 @@ impl<'a> Footprint<'a> {
         }
     }
 
-    /// Weights along `axis` for a footprint at `pos`, clipped to pixels `[lo, hi)`. `buffer`
-    /// is used where there is no table.
+    /// Returns the unitless weights of a footprint along `axis` (0: x, 1: y) at screen position
+    /// `pos` (1/256 pixel), clipped to pixels `[lo, hi)`. `buffer` is used where there is no table.
     #[inline(always)]
     pub fn weights<'b>(
         &'b self,
@@ -720,7 +728,7 @@ impl<'a> Footprint<'a> {
         self.window(axis, pos, clip, buffer, row, |w, _| Tap::new(w as f32))
     }
 
-    /// [`Footprint::weights`] in steps of the lattice, in units of 2^-15.
+    /// Returns [`Footprint::weights`] in fixed point: in steps of the lattice, in units of 2^-15.
     #[inline(always)]
     pub fn weights_fixed<'b>(
         &'b self,
@@ -744,7 +752,8 @@ impl<'a> Footprint<'a> {
         self.table.map(|t| &t.along(axis).fixed[..])
     }
 
-    /// Layout of the weight table along `axis`.
+    /// Returns the layout of the weight table along `axis` (0: x, 1: y); `None` where there is no
+    /// table.
     pub fn phases(&self, axis: usize) -> Option<Phases> {
         self.table.map(|t| t.along(axis).phases())
     }

@@ -28,15 +28,17 @@ use crate::primitives::sizes::REACHING;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::view::{SUBPIXELS, View};
 
-/// Pixels from a lattice row to the next, at least. At one a voxel has four or five rows of pixels,
-/// as a pixel has lattice rows; below, lattice rows outgrow the cache that those of pixels fit.
+/// Least number of pixels from a lattice row to the next. At one a voxel has four or five rows of
+/// pixels, as a pixel has lattice rows; below, lattice rows outgrow the cache that rows of pixels
+/// fit.
 pub const CLOSEST: f64 = 0.75;
 
 /// The lattice rows of a level view, from the top of the picture down.
 #[derive(Clone, Debug)]
 pub struct LatticeRows {
-    /// The lattice's upright axis, and whether higher indices lie higher in the picture.
+    /// Index of the lattice axis that is upright in the picture: 0, 1 or 2.
     pub axis: usize,
+    /// Whether higher indices along that axis lie higher in the picture.
     pub upwards: bool,
     /// Down the picture, in vox, of each lattice row.
     eye: Vec<f64>,
@@ -102,7 +104,8 @@ impl LatticeRows {
         self.eye.len()
     }
 
-    /// Where lattice row `s` lies down the picture in a sheet with this footprint, in subpixels.
+    /// Returns the screen position down the picture, in subpixels, of lattice row `s` in a sheet
+    /// with `footprint`.
     #[inline(always)]
     pub fn at(&self, view: &View, s: usize, footprint: &Footprint<'_>) -> i64 {
         match &self.flat {
@@ -117,7 +120,8 @@ impl LatticeRows {
         (y - self.eye[0]) / self.step
     }
 
-    /// Factor and summand that make of eye coordinates which lattice row it is.
+    /// Returns a factor and a summand that turn an eye coordinate down the picture, in vox, into a
+    /// number of lattice rows from the top.
     pub fn by_eye(&self) -> (f64, f64) {
         (1.0 / self.step, -self.eye[0] / self.step)
     }
@@ -133,8 +137,8 @@ impl LatticeRows {
         self.of_eye((f64::from(y) - f64::from(view.size[1]) * 0.5) / scale)
     }
 
-    /// The first lattice row that row 0 of a part stands for, in a sheet of this scale: it does not
-    /// reach the part, nor does the one of row [`LatticeRows::rows`] less one.
+    /// Returns the first lattice row that row 0 of a part stands for, in a sheet of `scale` pixels
+    /// a vox. Neither it nor the last of [`LatticeRows::rows`] reaches the part.
     #[inline(always)]
     pub fn base(&self, view: &View, part: &Rect, scale: f64) -> i32 {
         // A footprint reaches half a pixel less than its radius, and is placed to a subpixel.
@@ -143,8 +147,8 @@ impl LatticeRows {
         first.clamp(-1e9, 1e9) as i32
     }
 
-    /// Rows of lattice rows that a part of `high` pixels has at a scale, which are at most
-    /// [`ROWS`].
+    /// Returns the number of lattice rows for a part of `high` pixels at `scale` pixels a vox; at
+    /// most [`ROWS`].
     pub fn rows(&self, high: i32, scale: f64) -> usize {
         let across = f64::from(high) / (self.step * scale);
         libm::ceil(across + 2.0 * self.reach) as usize + 4

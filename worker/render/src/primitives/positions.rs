@@ -25,7 +25,7 @@ fn whole(x: f64) -> i64 {
     if x.abs() < (1u64 << 50) as f64 { round_i64(x) } else { x as i64 }
 }
 
-/// Positions in a flat view.
+/// Integer positions of voxels in an orthographic view.
 #[derive(Clone, Debug)]
 pub struct Places {
     /// Pixels a vox.
@@ -70,7 +70,8 @@ impl Places {
         [across(eye.x, self.middle[0]), across(eye.y, self.middle[1]), z]
     }
 
-    /// Screen position of a voxel in subpixels, and its depth in phases.
+    /// Returns a voxel's screen position in subpixels and its depth in phases; `local` is its index
+    /// in the brick, 0 to 511.
     pub fn at(&self, corner: FlatCorner, local: u16) -> ([i64; 2], i32) {
         let at = |axis: usize| {
             let offset = self.offsets[axis][usize::from(local & 511)];
@@ -79,8 +80,8 @@ impl Places {
         ([at(0), at(1)], at(2) as i32)
     }
 
-    /// What offsets are added to for [`Places::at`] counted from `origin` (subpixels and phases),
-    /// which is near: positions fit i32.
+    /// Returns the corner to which a voxel's offset is added for [`Places::at`] counted from
+    /// `origin` (subpixels and phases); with an origin nearby, positions fit i32.
     #[inline(always)]
     pub fn from(corner: FlatCorner, origin: [i64; 3]) -> FlatCorner {
         std::array::from_fn(|axis| corner[axis] - (origin[axis] << FINER_BITS) + HALF)

@@ -7,10 +7,11 @@
 pub const PART: i32 = 64;
 const _: () = assert!(PART == slabcast_common::region::PART_EDGE);
 
-/// Most sheets of one pixel record.
+/// Largest number of sheets in one pixel record.
 pub const MOST: usize = 8;
 
-/// Most pixels of a footprint along one axis whose weights are read as one register.
+/// Largest number of a footprint's pixels along one axis for which weights are read as one
+/// register.
 pub const LINE: usize = 16;
 
 /// Most pixel rows that all sections of a sheared voxel have together, and least number of zeros

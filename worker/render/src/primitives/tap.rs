@@ -7,13 +7,13 @@
 pub struct Tap(pub(crate) f32);
 
 impl Tap {
-    /// The weight `w`; what is negative or not a number is nothing.
+    /// Makes a weight of `w`; negative numbers and NaN become zero.
     #[inline]
     pub fn new(w: f32) -> Self {
         Tap(if w > 0.0 { w } else { 0.0 })
     }
 
-    /// The weight.
+    /// Returns the weight as a number, unitless and not negative.
     #[inline(always)]
     pub fn get(self) -> f32 {
         self.0

@@ -28,7 +28,7 @@ pub(crate) const CELL: i32 = 8;
 /// Cells across a part.
 const ROW: usize = (PART_EDGE / CELL) as usize;
 
-/// Sheets from one look at which of a part's cells are shut to the next.
+/// Number of sheets from one look at a part's shut cells to the next.
 pub const LOOKS: i32 = 8;
 
 /// A cell with fewer open pixels counts as shut.
@@ -110,14 +110,15 @@ impl ClosingDepths {
         (y0..y1.max(y0)).flat_map(move |y| &self.cells[y * self.columns..][x0..x1.max(x0)])
     }
 
-    /// Records the cells of `part`, which begins at a cell's corner.
+    /// Records the cells of `part`, whose upper left corner must be a cell's.
     pub fn note(&self, part: &Rect, cells: &Cells) {
         let wide = part.width().div_ceil(CELL as usize);
         let of_part = cells.0.chunks(ROW).flat_map(|row| &row[..wide.min(ROW)]);
         self.under(part).zip(of_part).for_each(|(to, depth)| to.store(*depth, Ordering::Relaxed));
     }
 
-    /// Whether a brick over rectangle `r` that begins at sheet `first` will probably be needed.
+    /// Returns whether a brick over rectangle `r` that begins at sheet `first` will probably be
+    /// needed.
     pub fn expects(&self, r: &Rect, first: i32) -> bool {
         let r = match r.width().min(r.height()) as i32 > 2 * BORDER {
             true => Rect::new(r.x0 + BORDER, r.y0 + BORDER, r.x1 - BORDER, r.y1 - BORDER),
@@ -126,8 +127,8 @@ impl ClosingDepths {
         first.saturating_add(SLACK) <= self.deepest(&r)
     }
 
-    /// The deepest sheet at which anything under a rectangle was open; `i32::MIN` where nothing was
-    /// drawn.
+    /// Returns the deepest sheet at which anything in rectangle `r` was open; `i32::MIN` where
+    /// nothing was drawn.
     pub fn deepest(&self, r: &Rect) -> i32 {
         self.under(r).map(|cell| cell.load(Ordering::Relaxed)).max().unwrap_or(i32::MIN)
     }

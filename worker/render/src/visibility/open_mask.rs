@@ -20,7 +20,8 @@ pub struct OpenMask {
     reach: [i32; 2],
 }
 
-/// Shifts that grow one pixel to a run of `n` when each ORs the run so far with itself moved by it.
+/// Returns the shifts, in pixels, that grow one set bit to a run of `n`: at each step the run is
+/// ORed with itself moved by the shift.
 #[inline(always)]
 pub fn doubling(n: usize) -> impl Iterator<Item = usize> {
     let mut done = 1;
@@ -31,7 +32,8 @@ pub fn doubling(n: usize) -> impl Iterator<Item = usize> {
     })
 }
 
-/// Farthest that a mask is grown: beyond it every footprint covers most of a part anyway.
+/// Largest number of pixels by which a mask is grown: beyond it every footprint covers most of a
+/// part anyway.
 pub const REACH_MOST: i32 = 31;
 
 impl OpenMask {
@@ -68,8 +70,8 @@ impl OpenMask {
         self.rows[y & 63]
     }
 
-    /// Grows the mask by `reach` columns and rows, each at most [`REACH_MOST`]. To be called again
-    /// after pixels were shut.
+    /// Grows the mask by `reach` columns and rows, each at most [`REACH_MOST`]. Must be called
+    /// again after pixels were shut.
     #[inline(always)]
     pub fn grow(&mut self, reach: [i32; 2]) {
         self.reach = reach.map(|reach| reach.min(REACH_MOST));
@@ -90,9 +92,9 @@ impl OpenMask {
         }
     }
 
-    /// For each centre (`x`, `y`, in subpixels from the part's corner): its nearest pixel in the
-    /// part, and whether a footprint of the mask's reach may touch the part (1) and an open pixel
-    /// of it (3).
+    /// Computes for each centre (`x`, `y`, in subpixels from the part's corner) the nearest pixel
+    /// of the part, and whether a footprint of the mask's reach may touch the part (1) and an open
+    /// pixel of it (3).
     #[inline(always)]
     pub fn near_all(&self, x: &[i32], y: &[i32], cells: &mut [u32], fate: &mut [u32]) {
         let [wide, high] = self.reach.map(|reach| (64 + 2 * reach) as u32);
@@ -113,7 +115,8 @@ impl OpenMask {
         (&self.grown, self.reach)
     }
 
-    /// Whether a pixel may be open near `cell`, a pixel that [`OpenMask::near_all`] returned.
+    /// Returns whether a pixel may be open near `cell`, a pixel that [`OpenMask::near_all`]
+    /// returned.
     #[inline(always)]
     pub fn is_near(&self, cell: u32) -> bool {
         self.grown[(cell >> 6 & 63) as usize] >> (cell & 63) & 1 == 1
@@ -124,7 +127,7 @@ impl OpenMask {
         self.rows.iter().map(|r| r.count_ones() as usize).sum()
     }
 
-    /// Whether any pixel of `rect` (picture coordinates) is open.
+    /// Returns whether any pixel of `rect` (picture coordinates) is open.
     #[inline(always)]
     pub fn any(&self, rect: &Rect) -> bool {
         let x0 = rect.x0.max(self.rect.x0) - self.rect.x0;

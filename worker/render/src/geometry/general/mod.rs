@@ -50,7 +50,7 @@ pub(crate) struct Kinds {
 /// Lattice rows that reach a row of pixels, and in which sheet.
 type OfSheet<W> = (Option<i32>, Reaching<W>);
 
-/// Memory for sums of one kind.
+/// Memory of a render thread for the sums of one number type.
 pub struct Kind<S: Accumulate> {
     planes: Planes<S>,
     /// In level views, from which `planes` are filled when a sheet closes.
@@ -73,18 +73,19 @@ impl<S: Accumulate> Default for Kind<S> {
     }
 }
 
-/// Voxels that wait.
+/// Voxels of a part that wait for the sheets at which they begin.
 #[derive(Default)]
 pub struct Queues {
+    /// Waiting voxels by their first sheet, counted from the slab's first.
     pub buckets: Vec<Vec<Waiting>>,
-    /// Buckets behind this hold nothing: a part that stops often doesn't look at those of all
-    /// sheets each time.
+    /// Number of buckets in use; later ones are empty. A part that stops often then doesn't look at
+    /// the buckets of all sheets each time.
     pub filled: usize,
     carried: Vec<Waiting>,
 }
 
 impl Queues {
-    /// Empties what an earlier part left, and makes room for one of `sheets`.
+    /// Empties the buckets of an earlier part and makes room for `sheets` sheets.
     #[inline(always)]
     pub fn begin(&mut self, sheets: usize) {
         if self.buckets.len() < sheets {
@@ -95,20 +96,21 @@ impl Queues {
         self.carried.clear();
     }
 
-    /// Puts a voxel before the sheet where it begins, counted from the slab's first.
+    /// Puts a voxel into the bucket of its first sheet, `sheet`, counted from the slab's first.
     #[inline(always)]
     pub fn put(&mut self, sheet: usize, voxel: Waiting) {
         self.buckets[sheet].push(voxel);
         self.filled = self.filled.max(sheet + 1);
     }
 
-    /// Voxels whose sheets were not come to.
+    /// Returns the number of voxels whose first sheet drawing has not reached.
     pub fn waiting(&self) -> u64 {
         self.buckets[..self.filled].iter().map(|b| b.len() as u64).sum()
     }
 }
 
-/// Draws a part, as work that is compiled once for each instruction set.
+/// Work that draws one part with any kernel, view and number type; it is compiled once for each
+/// instruction set.
 pub struct RenderGeneral<'a, S: Accumulate> {
     pub(crate) part: Part<'a>,
     pub(crate) kind: &'a mut Kind<S>,

@@ -27,11 +27,11 @@ use std::sync::Arc;
 /// three times as often for blocks of 8 as for a tile, and fifty times as often for single pixels.
 const BLOCK: i32 = 8;
 
-/// One pixel of this many is drawn again, in large pictures.
+/// Share of pixels that are drawn again in large pictures: one in this many.
 pub const ONE_IN: u32 = 128;
 
-/// Least number of blocks in a small picture. From half as many the estimate was off by more than a
-/// factor of two.
+/// Least number of blocks of 8x8 pixels that are drawn again in a small picture. From half as many
+/// the estimate was off by more than a factor of two.
 pub const AT_LEAST: u32 = 32;
 
 /// Factor of eps, the cut-off, for both pictures: so that their difference is due to thickness

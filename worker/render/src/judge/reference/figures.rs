@@ -29,7 +29,7 @@ pub struct ErrorFigures {
     pub share_above_1: f64,
     /// Root mean square error over RGB of the 8-bit sRGB pictures, in steps of 8 bits.
     pub rmse_srgb8: f64,
-    /// Number of pixels counted.
+    /// Number of pixels that were compared: those with alpha above zero in either picture.
     pub n_pixels: usize,
 }
 

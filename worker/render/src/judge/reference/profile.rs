@@ -10,16 +10,19 @@ use std::sync::Arc;
 /// `slabcast error` took a quarter longer (mri256, peer-semi, perspective; processor seconds).
 const NODES_PER_STD: f64 = 160.0;
 
-/// One axis of the kernel.
+/// Kernel along one axis, in f64, tabulated from its middle to its radius.
 #[derive(Clone, Debug)]
 pub struct Profile {
+    /// Support radius in vox: the profile is zero beyond it.
     pub radius: f64,
+    /// Formula of the profile, from which integrals come.
     pub form: Form,
     /// The profile from the middle to the radius, with its slope times the step.
     table: Arc<[[f64; 2]]>,
     per_step: f64,
 }
 
+/// Formula of a kernel's profile along one axis.
 #[derive(Clone, Copy, Debug)]
 pub enum Form {
     /// `(exp(-u^2 / 2 std^2) - edge) / norm` inside the radius.
@@ -28,12 +31,15 @@ pub enum Form {
     Pieces,
 }
 
+/// Constants of a truncated Gaussian profile, derived from its standard deviation.
 #[derive(Clone, Copy, Debug)]
 pub struct Gaussian {
     std: f64,
-    /// `1 / 2 std^2`.
+    /// Factor in the exponent, `1 / 2 std^2`, per vox squared.
     pub steep: f64,
+    /// Unitless value of the bare Gaussian (1 at its middle) at the radius, which is subtracted.
     pub edge: f64,
+    /// Reciprocal of the norm: one over the integral of the Gaussian less its edge, per vox.
     pub per_norm: f64,
     /// Half the integral of the Gaussian inside the radius, without edge and norm.
     half_bell: f64,
@@ -45,6 +51,7 @@ const THREE: [(f64, f64); 3] =
     [(-0.774_596_669_241_483_4, 5.0 / 9.0), (0.0, 8.0 / 9.0), (0.774_596_669_241_483_4, 5.0 / 9.0)];
 
 impl Profile {
+    /// Tabulates the profile of `kernel`; `std` and `radius` are in vox.
     pub fn new(kernel: Kernel, std: f64, radius: f64) -> Profile {
         // Values and slopes of B-splines at their knots, in steps.
         match kernel {
@@ -63,6 +70,8 @@ impl Profile {
         Profile { radius, form: Form::Pieces, table, per_step }
     }
 
+    /// Tabulates a Gaussian of deviation `std`, cut at `radius`, both in vox, with its edge value
+    /// subtracted and its integral 1.
     pub fn gaussian(std: f64, radius: f64) -> Profile {
         let steep = 0.5 / (std * std);
         let edge = libm::exp(-radius * radius * steep);
@@ -99,6 +108,7 @@ impl Profile {
         Profile::with(g.std, radius, 0.0, 1.0 / bell)
     }
 
+    /// Returns the profile `u` vox from its middle, per vox.
     #[inline]
     pub fn at(&self, u: f64) -> f64 {
         let u = u.abs();
@@ -117,7 +127,7 @@ impl Profile {
         a + t * (da + t * (c + (t - 1.0) * d))
     }
 
-    /// The integral from the left edge to `u`.
+    /// Returns the integral of the profile from its left edge to `u` vox from its middle, 0 to 1.
     pub fn integral_to(&self, u: f64) -> f64 {
         if u <= -self.radius {
             return 0.0;

@@ -128,13 +128,16 @@ impl Light {
 /// well, since light and depth are integrated as one system.
 #[derive(Clone, Copy, Debug)]
 pub struct Gauss {
+    /// Nodes of the rule on the unit interval, 0 to 1.
     pub nodes: [f64; 4],
+    /// Weights of the rule on the unit interval; they add up to 1.
     pub weights: [f64; 4],
     /// The integral up to node i of the polynomial that is one at node j and zero at the others.
     pub up_to: [[f64; 4]; 4],
 }
 
 impl Gauss {
+    /// Computes nodes, weights and partial integrals of the rule with four nodes.
     pub fn four_nodes() -> Gauss {
         let inner = (3.0 / 7.0 - 2.0 / 7.0 * 1.2f64.sqrt()).sqrt();
         let outer = (3.0 / 7.0 + 2.0 / 7.0 * 1.2f64.sqrt()).sqrt();

@@ -39,7 +39,7 @@ impl SectionPlacement {
     }
 }
 
-/// Options of [`Reference::by_sheets`].
+/// Options for a reference picture that is drawn sheet by sheet ([`Reference::by_sheets`]).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SheetOptions {
     /// Depth at which footprints of sections are placed.

@@ -3,7 +3,8 @@
 use super::Simd;
 use slabcast_common::transfer::OpticalSample;
 
-/// Extinctions, then each colour, of the looks that `table` has at `codes`.
+/// Looks sample codes up in `table`, many at once: `out` gets the extinction per vox of each code,
+/// then red, green and blue.
 ///
 /// # Panics
 /// If a code is not in the table.
@@ -25,6 +26,8 @@ pub fn take<const MOST: usize>(
     }
 }
 
+/// Looks the codes from number `from` on up, one by one, in plain code that every instruction set
+/// gives the results of.
 #[inline(always)]
 pub fn one_by_one<const MOST: usize>(
     table: &[OpticalSample],

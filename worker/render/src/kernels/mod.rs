@@ -143,7 +143,7 @@ pub trait Accumulate: Sum {
 pub struct Section(f32);
 
 impl Section {
-    /// What is negative or not a number is nothing.
+    /// Makes a channel of a section; negative numbers and NaN become zero.
     #[inline(always)]
     pub fn new(section: f32) -> Self {
         // A select, so that NaN too ends inside.
@@ -151,12 +151,11 @@ impl Section {
     }
 }
 
-/// The largest f32 below 2^31.
+/// Largest f32 below 2^31, a number of raw units: the largest sum that becomes an i32.
 pub const LARGEST: f32 = 2_147_483_520.0;
 
-/// The whole number nearest to `x`, which is not negative, of two the even one; the largest that an
-/// f32 can be below 2^31 for what is larger or not a number. One instruction on lanes, where
-/// nothing is larger.
+/// Returns the whole number nearest to `x`, which is not negative, ties to even. What is larger
+/// than an i32, or NaN, becomes [`LARGEST`]. One instruction on lanes, where nothing is larger.
 #[inline(always)]
 pub fn nearest(x: f32) -> i32 {
     let x = if x < LARGEST { x } else { LARGEST };
@@ -332,13 +331,14 @@ impl Accumulate for i16 {
     }
 }
 
-/// The section of a 16-bit payload: each channel times `wz`.
+/// Returns the section of a 16-bit payload: each channel times the weight in depth `wz`, which is
+/// in units of 2^-15.
 #[inline(always)]
 pub fn section_fixed(payload: [i16; 4], wz: i16) -> [i16; 4] {
     payload.map(|p| times(p, wz))
 }
 
-/// A payload of 16-bit sums: rounded to nearest, 0 to 32767.
+/// Returns a payload of 16-bit sums: `payload` rounded to nearest, 0 to 32767.
 #[inline(always)]
 pub fn whole(payload: f32) -> i16 {
     let bounded = bounded(payload + 0.5, 32767.0);
@@ -353,7 +353,7 @@ fn bounded(x: f32, most: f32) -> f32 {
     if x < most { x } else { most }
 }
 
-/// The whole number below `x`, 0 to 2^31: of what is negative or not a number 0.
+/// Returns the whole number below `x`, 0 to 2^31; 0 for negative numbers and NaN.
 #[inline(always)]
 pub fn truncate(x: f32) -> u32 {
     let bounded = bounded(x, LARGEST);
@@ -365,6 +365,7 @@ pub fn truncate(x: f32) -> u32 {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Simd(Level);
 
+/// Instruction sets that kernels are written for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Level {
     Plain,
@@ -377,17 +378,17 @@ pub enum Level {
 }
 
 impl Simd {
-    /// The widest that this machine has.
+    /// Returns the widest instruction set that this machine has.
     pub fn detect() -> Self {
         *Self::all().last().expect("plain is always there")
     }
 
-    /// The baseline.
+    /// Returns the instruction set of the build's target, which every machine has.
     pub fn plain() -> Self {
         Simd(Level::Plain)
     }
 
-    /// All that this machine has, plain first.
+    /// Returns all instruction sets that this machine has, the plain one first.
     pub fn all() -> Vec<Self> {
         #[allow(unused_mut, reason = "grows on x86-64 and 64-bit ARM only")]
         let mut all = vec![Simd(Level::Plain)];
@@ -418,7 +419,7 @@ impl Simd {
         all
     }
 
-    /// For people.
+    /// Returns the name of the instruction set for people, `avx2` for example.
     pub fn name(self) -> &'static str {
         match self.0 {
             Level::Plain => "plain",
@@ -432,9 +433,9 @@ impl Simd {
     }
 }
 
-/// `n`, or a few more for the last register of a loop to be full: what does not fill one is worked
-/// out one by one, and there may be as much of that as of the rest. No more than `MOST`, which
-/// compilers then know.
+/// Returns how many of a loop's items to work out for `n` that are needed: `n` rounded up to whole
+/// registers of 16, at most `MOST`. Items that do not fill a register are worked out one by one,
+/// which may take as long as all the rest. Compilers know the limit.
 #[inline(always)]
 pub fn whole_registers<const MOST: usize>(n: usize) -> usize {
     const { assert!(MOST.is_multiple_of(16)) };

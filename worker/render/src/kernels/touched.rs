@@ -11,7 +11,7 @@ use crate::kernels::composite::{LANES, Row};
 /// Pixels of a part at most, and as many lanes behind them as are stored at once.
 const MOST: usize = 64 * 64 + LANES;
 
-/// Places of a part.
+/// Number of places in a part: 64 rows of [`STRIDE`] places.
 pub const PART: usize = 64 * STRIDE;
 
 /// Places of pixels in a part: `row * STRIDE + column`.
@@ -37,13 +37,13 @@ pub struct Some16<'a> {
 
 #[expect(clippy::len_without_is_empty, reason = "callers only loop over it")]
 impl<'a> Some16<'a> {
-    /// All of them.
+    /// Returns all sixteen places, each inside a part; only the first [`Some16::len`] count.
     #[inline(always)]
     pub fn at(self) -> &'a [u32; LANES] {
         self.at
     }
 
-    /// How many of them count.
+    /// Returns how many of the sixteen places count, from the first on.
     #[inline(always)]
     pub fn len(self) -> usize {
         self.n
@@ -52,7 +52,7 @@ impl<'a> Some16<'a> {
 
 #[expect(clippy::len_without_is_empty, reason = "callers only loop over it")]
 impl Places {
-    /// Those of the bits in `rows`.
+    /// Lists the places whose bits are set in `rows`: bit x of word y is column x of row y.
     #[inline(always)]
     pub fn list(&mut self, simd: Simd, rows: &[u64; 64]) {
         self.n = 0;
@@ -70,6 +70,7 @@ impl Places {
         }
     }
 
+    /// Lists as [`Places::list`] does, in plain code.
     pub fn list_plain(&mut self, rows: &[u64; 64]) {
         for (y, row) in rows.iter().enumerate() {
             let mut row = *row;
@@ -81,8 +82,8 @@ impl Places {
         }
     }
 
-    /// Leaves only those where the sheet that `slot` holds has any extinction. At the others it is
-    /// over and done with: what there is of its sums are the ones before, and the slot is empty.
+    /// Drops the places where the sheet of `slot` has no extinction. Such a pixel's sheet is over:
+    /// its sums become those of the sheet before, and the slot is empty.
     ///
     /// # Panics
     /// If there are fewer records or sums than a part has.
@@ -140,17 +141,17 @@ impl Places {
         self.n = n;
     }
 
-    /// All of them.
+    /// Returns all listed places, each `row * STRIDE + column`.
     pub fn all(&self) -> &[u32] {
         &self.at[..self.n]
     }
 
-    /// How many there are.
+    /// Returns the number of listed places.
     pub fn len(&self) -> usize {
         self.n
     }
 
-    /// Those from the `i`th on, at most sixteen. Lanes behind the last hold places that there are,
+    /// Returns up to sixteen places from number `i` on. Lanes behind the last hold valid places,
     /// too.
     #[inline(always)]
     pub fn from(&self, i: usize) -> Some16<'_> {
@@ -159,15 +160,15 @@ impl Places {
     }
 }
 
-/// Column and row of a place.
+/// Returns the column and row of a place in a part, in pixels.
 #[inline(always)]
 pub fn column_and_row(place: u32) -> [usize; 2] {
     let place = place as usize;
     [place % STRIDE, place / STRIDE]
 }
 
-/// A pixel's first 32 bits: its extinction, and no more than one colour beside it. Zero: it has
-/// none.
+/// Returns a pixel's first 32 bits: its extinction, and at most one colour beside it. Zero means
+/// that the pixel has no extinction.
 #[inline(always)]
 pub fn first_word<P: bytemuck::Pod>(pixel: &P) -> u32 {
     bytemuck::pod_read_unaligned(&bytemuck::bytes_of(pixel)[..4])
@@ -233,7 +234,8 @@ fn take_plain<S: Recorded, const N: usize>(
     }
 }
 
-/// The same of pixels whose sums are beside each other, sheet by sheet, as are their opacities.
+/// Fills a row that is to be closed from pixels that lie side by side: `sheets` has their sums in
+/// the sheet before, the closing one and the one behind, `opacities` their opacities so far.
 #[inline(always)]
 pub fn unpack<S: Recorded>(
     simd: Simd,
@@ -265,7 +267,7 @@ pub fn unpack<S: Recorded>(
     }
 }
 
-/// Puts what a closed row says of its first pixels into those of a part, at these places.
+/// Writes the opacity and light of a closed row's first pixels to their places `at` in a part.
 ///
 /// # Panics
 /// If a place is none of the part.

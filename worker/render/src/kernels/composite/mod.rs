@@ -102,8 +102,9 @@ pub struct Rule {
 }
 
 impl Rule {
-    /// `unit`: optical depth of a raw unit; `y`: sheet thickness over the kernel's standard
-    /// deviation along the view axis; `eps`: transmittance below which a pixel is shut.
+    /// Makes the rule for a view. `unit` is the optical depth of a raw unit, `y` the sheet
+    /// thickness over the kernel's standard deviation along the view axis (unitless), `eps` the
+    /// transmittance below which a pixel is shut.
     pub fn new(compositing: Compositing, unit: f32, y: f64, eps: f32) -> Self {
         // Fitted on five volumes; their sum tends to 1 with y, which restores fourth order.
         let gain_before = 0.5 + 0.20 * y;
@@ -126,13 +127,14 @@ impl Rule {
         Rule { eps: 0.0, ..self }
     }
 
-    /// Whether a pixel with opacity `a` is shut for good.
+    /// Returns whether a pixel with opacity `a` (0 to 1) is shut for good.
     #[inline(always)]
     pub fn is_shut(&self, a: f32) -> bool {
         1.0 - a < self.eps
     }
 
-    /// Optical depth of a raw sum along a ray (the sum of opacities, for the paper's compositing).
+    /// Returns the optical depth of a raw sum along a ray (the sum of opacities, for the paper's
+    /// compositing). `secant` is the ray's length in a sheet over the sheet's thickness.
     #[inline(always)]
     pub fn optical_depth(&self, raw: f32, secant: f32) -> f32 {
         raw * self.unit * secant
@@ -266,19 +268,19 @@ fn select(which: bool, yes: f32, no: f32) -> f32 {
 /// [`Rule::close_row`] works on. Lanes are pixels.
 #[derive(Clone)]
 pub struct Row {
-    /// Raw sums of sheet k-1: extinction and three colours.
+    /// Raw sums of sheet k-1 by channel (extinction, three colours times extinction) and lane.
     pub before: [[f32; LANES]; 4],
-    /// Of sheet k.
+    /// Raw sums of sheet k, which closes, by channel and lane.
     pub here: [[f32; LANES]; 4],
-    /// Of sheet k+1 as it stands.
+    /// Raw sums of sheet k+1 as it stands, half filled, by channel and lane.
     pub behind: [[f32; LANES]; 4],
-    /// Length of the rays in the sheet over its thickness, and one over it.
+    /// Length of each ray in a sheet over the sheet's thickness; unitless, 1 or more.
     pub secant: [f32; LANES],
-    /// One over the secant.
+    /// Thickness of a sheet over the length of each ray in it; unitless, up to 1.
     pub cosine: [f32; LANES],
-    /// Opacity before, and after.
+    /// Opacity of each pixel, 0 to 1: in front of the sheet before it closes, behind it afterwards.
     pub a: [f32; LANES],
-    /// Light that the sheet adds, in fixed point.
+    /// Light that the sheet adds to each pixel, by colour, in fixed point of 2^-28.
     pub light: [[u32; LANES]; 3],
 }
 

@@ -12,7 +12,8 @@ use crate::kernels::{Simd, Work};
 use slabcast_common::quality::Compositing;
 use std::marker::PhantomData;
 
-/// [`Rule::close_row`] for some rows.
+/// Closes a sheet in several rows at once, each as [`Rule::close_row`] does. `live` has a bit for
+/// each open pixel of each row; returned are the bits of pixels that are shut now.
 #[inline(always)]
 pub fn close_rows<S: Sum, const ROWS: usize>(
     simd: Simd,

@@ -86,13 +86,13 @@ pub const STRIDE: usize = 66;
 /// The sums of N sheets at one pixel: extinction and three colours each, or extinction and grey.
 pub type Record<S, const N: usize> = [<S as Recorded>::Pixel; N];
 
-/// Memory of records: a line of the cache.
+/// Memory of records: 64 bytes, one line of the cache.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
 pub struct Line([u8; 64]);
 
 impl Line {
-    /// Nothing.
+    /// A line whose bytes are all zero: sums of nothing.
     pub const ZERO: Line = Line([0; 64]);
 }
 
@@ -101,10 +101,12 @@ unsafe impl bytemuck::Zeroable for Line {}
 // SAFETY: as above; any bytes will do.
 unsafe impl bytemuck::Pod for Line {}
 
-/// Weights along one axis: wherever a row begins, `len` of them are one's.
+/// Table of weights along one axis, one row after another, each of `len` weights.
 #[derive(Clone, Copy, Debug)]
 pub struct Table<'a, W> {
+    /// Weights of all rows; a row may begin at any index.
     pub weights: &'a [W],
+    /// Number of weights of one row.
     pub len: usize,
 }
 
@@ -116,12 +118,12 @@ impl<'a, W> Table<'a, W> {
     }
 }
 
-/// The tables of a view.
+/// Weight tables of a view: across, down and in depth.
 #[derive(Clone, Copy)]
 pub struct Tables<'a, S: Recorded> {
-    /// Across and down.
+    /// Tables of the weights across and down the picture.
     pub across: [Table<'a, S::Weight>; 2],
-    /// In depth.
+    /// Table of the weights in depth, a row for each depth phase.
     pub deep: Table<'a, S::Depth>,
 }
 
@@ -130,15 +132,18 @@ pub struct Tables<'a, S: Recorded> {
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(16))]
 pub struct Splat {
-    /// First column and row of its footprint, a byte each, and above them the pixel of the part
-    /// that is nearest to its centre: 64 times the row, and the column.
+    /// Places of the voxel, packed. Bits 0 to 7 are its footprint's first column, bits 8 to 15 the
+    /// first row. The bits above name the part's pixel nearest to its centre: 64 times the row, and
+    /// the column.
     pub place: u32,
-    /// Where its weights across begin and, above that, those down; of a voxel whose sections lie
-    /// aside of each other, where it is itself.
+    /// Indices at which the weights across (low 16 bits) and down (high 16 bits) begin. Of a voxel
+    /// whose sections have places of their own, its position in subpixels instead, x low and y
+    /// high.
     pub rows: u32,
-    /// Depth in phases from its sheet's front and, above that, its normal.
+    /// Depth of the voxel in phases from its sheet's front (low 16 bits), and its normal code (high
+    /// 16 bits).
     pub deep: u32,
-    /// Its sample's bits.
+    /// Sample code of the voxel, as bits.
     pub sample: u32,
 }
 
@@ -197,23 +202,29 @@ impl Splat {
     }
 }
 
-/// A weight for each slot.
+/// Weights by slot, one for each sheet that a record holds.
 pub type BySlot<W, const N: usize> = [W; N];
 
 /// Weights by column and slot, and by row and slot.
 pub(crate) type Across<'a, W, const N: usize> = (&'a [BySlot<W, N>], &'a [BySlot<W, N>]);
 
-/// A row of weights among others, and which column its first belongs to.
+/// One footprint's weights among others in a table, and the column that its first weight belongs
+/// to.
 #[derive(Clone, Copy, Debug)]
 pub struct RowAt<'a, W> {
+    /// Table that holds the weights.
     pub table: &'a [W],
+    /// Index in the table at which the weights begin.
     pub from: usize,
+    /// Number of weights.
     pub len: usize,
+    /// Column (or row) of the first weight, in pixels from where the window begins; may be
+    /// negative.
     pub column: i32,
 }
 
 impl<'a, W> RowAt<'a, W> {
-    /// No weights.
+    /// A row without a weight.
     pub const NONE: Self = RowAt { table: &[], from: 0, len: 0, column: 0 };
 
     /// The same beside a table. A load of no lanes takes a machine hundreds of cycles where nothing
@@ -234,14 +245,14 @@ impl<'a, W> RowAt<'a, W> {
         (present as u16, row.as_ptr().wrapping_offset(-(self.column as isize)))
     }
 
-    /// The weights.
+    /// Returns the row's weights.
     #[inline(always)]
     pub fn row(&self) -> &'a [W] {
         &self.table[self.from..self.from + self.len]
     }
 }
 
-/// Sums that records are made of.
+/// A kind of sums that pixel records are made of: its types, and how voxels are added.
 pub trait Recorded: Accumulate {
     /// Sums of one sheet at a pixel.
     type Pixel: bytemuck::Pod + Default + PartialEq + std::fmt::Debug;

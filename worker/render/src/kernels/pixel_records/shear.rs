@@ -51,7 +51,8 @@ use crate::kernels::Simd;
 pub use crate::primitives::footprint::Slant;
 pub use crate::primitives::sizes::{SHEAR_COLUMNS as COLUMNS, SHEAR_ROWS as ROWS};
 
-/// Whether these are added in lanes, so that where they lie in each sheet need not be known.
+/// Returns whether sheared voxels of sums `S` are added in lanes; their places in each sheet need
+/// then not be known.
 #[inline(always)]
 pub fn in_lanes<S: Recorded>(simd: Simd) -> bool {
     let are_there = match simd.0 {

@@ -17,35 +17,38 @@ pub(crate) use crate::primitives::sizes::LINE;
 use crate::primitives::sizes::PART;
 use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
 
-/// Voxels that are placed, shaded and splatted together.
+/// Number of voxels that are placed, shaded and splatted together.
 pub const BATCH: usize = 64;
 
-/// A number a voxel.
+/// One value for each voxel of a batch.
 pub type Each<T> = [T; BATCH];
 
-/// Pixels of a window at most, along an axis: a footprint of eight pixels a vox.
+/// Largest width of a window in pixels along an axis: a footprint of eight pixels a vox.
 pub const WINDOW: usize = 40;
 
-/// Where the sections of some voxels lie.
+/// Places of a batch of voxels whose sections have footprints of their own. Arrays are by axis
+/// (across, down), then slot, then voxel.
 pub struct Apart {
-    /// First pixels of footprints, from the part's corner, and where weights begin: by axis and
-    /// slot.
+    /// First pixel of each footprint, from the part's corner.
     pub first: [[Each<i32>; MOST]; 2],
+    /// Index in the weight table at which each footprint's weights begin.
     pub from: [[Each<u32>; MOST]; 2],
-    /// Where footprints lie themselves, in subpixels from the part's corner: known where rows lie
-    /// aside.
+    /// Positions of footprints, in subpixels from the part's corner; known where rows are offset
+    /// from each other.
     pub places: [[Each<i32>; MOST]; 2],
-    /// Where voxels do, where their sections lie aside of them.
+    /// Positions of voxels, in subpixels from the part's corner; known where sections are offset
+    /// from their voxels.
     pub at: [Each<i32>; 2],
-    /// By axis, the window inside the part that holds all footprints of a voxel: its first pixel,
-    /// and the one behind its last.
+    /// First pixel, by axis, of the window inside the part that holds all footprints of a voxel.
     pub lo: [Each<i32>; 2],
+    /// One past the last pixel, by axis, of the window inside the part that holds all footprints of
+    /// a voxel.
     pub hi: [Each<i32>; 2],
-    /// Sheets that a voxel has left, from the one at hand, and where its weights in depth for these
-    /// begin.
+    /// Number of sheets that each voxel has left, counted from the one at hand.
     pub left: Each<i32>,
+    /// Index at which each voxel's weights in depth begin, for the sheets it has left.
     pub deep: Each<u32>,
-    /// Voxels that are added.
+    /// Indices in the batch of the voxels to add.
     pub kept: Each<u32>,
 }
 
@@ -66,10 +69,11 @@ impl Default for Apart {
 }
 
 impl Apart {
-    /// Has sections of the first `n` voxels lie as far aside along `axis` as `aside` says of each
-    /// phase's sheets ([`Leaning::subpixels`](crate::primitives::footprint::Leaning::subpixels)):
-    /// in so many sheets from that on which slot `first` holds. What lies behind a voxel's last
-    /// section may lie anywhere.
+    /// Offsets the sections of the first `n` voxels along `axis`. `aside` has the offset in each
+    /// sheet for each depth phase, in subpixels
+    /// ([`Leaning::subpixels`](crate::primitives::footprint::Leaning::subpixels)). `sheets` is the
+    /// slot of the first sheet and the number of sheets. Sections behind a voxel's last may get any
+    /// place.
     #[inline(always)]
     pub fn lean<const N: usize>(
         &mut self,
@@ -109,8 +113,8 @@ impl Apart {
         self.hi[axis][..n].fill(i32::MIN);
     }
 
-    /// Has the windows hold footprints of `len` pixels along `axis` in a slot, of which voxels have
-    /// some if they have more than `sheets` left.
+    /// Widens the windows to hold footprints of `len` pixels along `axis` in `slot`, of the voxels
+    /// that have more than `sheets` sheets left.
     #[inline(always)]
     pub fn hold(&mut self, axis: usize, slot: usize, n: usize, (len, sheets): (i32, i32)) {
         let first = &self.first[axis][slot];
@@ -122,8 +126,8 @@ impl Apart {
         }
     }
 
-    /// The same across where rows lie aside of each other: `row` is [`Lean::row_fixed`], and rows
-    /// are placed.
+    /// Widens the windows across to hold footprints in `slot` whose rows are offset from each
+    /// other: `row` is [`Lean::row_fixed`]. Rows must have been placed.
     #[inline(always)]
     pub fn hold_skewed(
         &mut self,
@@ -145,7 +149,7 @@ impl Apart {
         }
     }
 
-    /// Cuts windows along `axis` where the part ends.
+    /// Clips the windows of the first `n` voxels along `axis` to the part.
     #[inline(always)]
     pub fn cut(&mut self, axis: usize, n: usize) {
         for lo in &mut self.lo[axis][..n] {
@@ -222,19 +226,19 @@ mod lean {
     }
 }
 
-/// What the sheets are that voxels reach from one on.
+/// Weights in the sheets that voxels reach, from the sheet of `slot` on.
 #[derive(Clone, Copy)]
 pub struct Layers<'a, S: Recorded, const N: usize> {
     /// Weights across and down, by slot.
     pub across: [[Table<'a, S::Weight>; N]; 2],
-    /// In depth.
+    /// Table of the weights in depth, a row for each depth phase.
     pub deep: Table<'a, S::Depth>,
-    /// Of the first of them.
+    /// Slot of the first sheet, 0 to N - 1.
     pub slot: usize,
-    /// Whether a voxel has the same columns in all of them, with the same weights.
+    /// Whether a voxel has the same columns, with the same weights, in all these sheets.
     pub alike: bool,
-    /// How sections lie aside of each other, if where they are is looked up as voxels are added
-    /// (shear).
+    /// Offsets of sections from each other, where places are looked up as voxels are added (shear);
+    /// else `None`.
     pub slant: Option<Slant<'a>>,
 }
 
@@ -266,20 +270,21 @@ impl<'a, S: Recorded, const N: usize> Layers<'a, S, N> {
         rows
     }
 
-    /// How many sheets behind the first `slot` belongs to.
+    /// Returns by how many sheets the next sheet of `slot` lies behind the first one.
     #[inline(always)]
     pub fn after(&self, slot: usize) -> i32 {
         after::<N>(self.slot, slot)
     }
 }
 
-/// How many sheets behind the one that slot `first` holds is the next one that `slot` does.
+/// Returns by how many sheets the next sheet of `slot` lies behind the one that slot `first` holds,
+/// 0 to N - 1.
 #[inline(always)]
 pub fn after<const N: usize>(first: usize, slot: usize) -> i32 {
     ((slot + N - first) % N) as i32
 }
 
-/// Memory for weights that are put side by side.
+/// Memory for weights of one voxel that are put side by side, by column or row and slot.
 pub struct Woven<W, const N: usize> {
     /// By slot, of a window's columns and of its rows.
     by_slot: [[BySlot<W, N>; WINDOW]; 2],

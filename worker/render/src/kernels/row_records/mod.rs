@@ -23,14 +23,14 @@ use crate::kernels::composite::LANES;
 use crate::primitives::sizes::PART;
 use crate::primitives::sizes::{LATTICE_ROWS as ROWS, REACHING};
 
-/// Which memory the tiers of a part take.
+/// Layout of the memory that the tiers of a part take.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Shape {
     /// Tiers of a sheet.
     pub(crate) rows: usize,
     /// Lines of the cache of a tier.
     wide: usize,
-    /// Columns before a part's first.
+    /// Columns of a tier before the part's first.
     pub margin: usize,
     /// Pixels of a line.
     line: usize,
@@ -51,7 +51,7 @@ fn groups(len: usize, columns: usize) -> usize {
 }
 
 impl Shape {
-    /// For footprints of at most `len` columns and so many tiers.
+    /// Computes the layout for `rows` tiers a sheet and footprints of at most `len` columns.
     pub fn new<S: Recorded>(rows: usize, len: usize) -> Shape {
         assert!(rows <= ROWS && len < 64, "{rows} tiers for footprints of {len}");
         let margin = len.next_multiple_of(8);
@@ -64,18 +64,20 @@ impl Shape {
         Shape { rows, wide, margin, line: a_line::<S>(), len }
     }
 
-    /// Lines of tiers for `sheets`.
+    /// Returns the number of cache lines that the tiers of `sheets` sheets take.
     pub fn lines(&self, sheets: usize) -> usize {
         sheets * self.rows * self.wide
     }
 
-    /// The place of a footprint's first pixel, which is at `first` in the part: it may lie outside.
+    /// Returns the index in a tier of a footprint's first pixel, which is in column `first` of the
+    /// part and may lie outside.
     #[inline(always)]
     pub fn place(&self, first: i32) -> u32 {
         (first + self.margin as i32).clamp(0, self.margin as i32 + PART) as u32
     }
 
-    /// The same among the pixels of all tiers of a sheet.
+    /// Returns the index among the pixels of all tiers of a sheet of a footprint's first pixel,
+    /// which is in column `first` of the part and in tier number `tier`.
     #[inline(always)]
     pub fn place_in(&self, tier: u32, first: i32) -> u32 {
         tier * (self.wide * self.line) as u32 + self.place(first)
@@ -96,17 +98,19 @@ pub struct Tiers<'a, S: Recorded, const N: usize> {
     kind: std::marker::PhantomData<S>,
 }
 
-/// Weights across and in depth.
+/// Weight tables of voxels in a level view: across the picture and in depth.
 #[derive(Clone, Copy)]
 pub struct Weights<'a, S: Recorded> {
+    /// Table of the weights across the picture.
     pub across: Table<'a, S::Weight>,
+    /// Table of the weights in depth, a row for each depth phase.
     pub deep: Table<'a, S::Depth>,
 }
 
-/// Rows of a part.
+/// Number of pixel rows of a part.
 pub const EDGE: usize = PART as usize;
 
-/// The tiers that reach each row of pixels in a sheet, and what they weigh there.
+/// Tiers that reach each row of pixels in a sheet, and their weights there.
 pub struct ByRow<W> {
     /// The first of them, and how many there are: four at least.
     reach: [[u8; 2]; EDGE],
@@ -121,13 +125,13 @@ impl<W: Weight> Default for ByRow<W> {
     }
 }
 
-/// Tiers that reach a row of pixels at least, some with no weight: as many as do if a kernel
+/// Least number of tiers that reach a row of pixels, some with no weight: as many as do if a kernel
 /// reaches two steps of the lattice to either side.
 pub const FOUR: usize = 4;
 
 impl<W: Weight> ByRow<W> {
-    /// Has `n` tiers from `begin` on reach row `y`, by the weight of each: those before the first
-    /// and behind the last with any are left out, but for four.
+    /// Sets the tiers that reach row `y`: `n` from number `begin` on, each with the weight that
+    /// `weight` returns. Leading and trailing tiers without weight are left out, down to four.
     #[inline(always)]
     pub fn set(&mut self, y: usize, [begin, n]: [usize; 2], weight: impl Fn(usize) -> W) {
         let (mut from, mut to) = (0, n.min(REACHING));
@@ -154,26 +158,31 @@ impl<W: Weight> ByRow<W> {
     }
 }
 
-/// A sheet that closes, and what is known of the one before.
+/// A sheet that closes, with the sums of the one before.
 pub struct Ends<'a, S: Recorded> {
-    /// Pixels that are open and that something was added to.
+    /// Pixels that are open and that something was added to, one bit each by row.
     pub open: &'a [u64; EDGE],
-    /// Of the sheet and of the one behind.
+    /// Slots of the closing sheet and of the one behind.
     pub slots: [usize; 2],
+    /// Tiers that reach each pixel row, in the closing sheet and in the one behind.
     pub by_row: [&'a ByRow<S::Weight>; 2],
-    /// Sums of the sheet before, in rows of [`STRIDE`]; then of this one.
+    /// Sums of the sheet before, in rows of [`STRIDE`] pixels; replaced by the sums of the closing
+    /// one.
     pub before: &'a mut [S::Pixel],
-    /// Pixels that `before` is of: elsewhere there is nothing, whatever it says.
+    /// Pixels, one bit each by row, at which `before` is valid; elsewhere it counts as zero.
     pub was: &'a mut [u64; EDGE],
-    /// As `crate::tile::Pixels` has them.
+    /// Opacity (f32 bits) and three colours (fixed point) of each pixel of the part, as in
+    /// `crate::tile::Pixels`.
     pub pixels: &'a [[u32; 4]],
 }
 
-/// Pixels that close, beside each other: where they are, what they have of the sheet before, of
-/// theirs and of the one behind, and how opaque they are.
+/// Pixels that close together, one beside the other: their places, sums and opacities.
 pub struct Folded<S: Recorded> {
+    /// Places of the pixels in the part.
     pub places: Places,
+    /// Sums of each pixel in three sheets: the one before, the closing one and the one behind.
     pub sheets: Box<[[S::Pixel; MOST_CLOSING]; 3]>,
+    /// Opacity of each pixel in front of the closing sheet, 0 to 1.
     pub opacities: Box<[f32; MOST_CLOSING]>,
 }
 
@@ -248,6 +257,7 @@ impl<'a, S: Recorded, const N: usize> Tiers<'a, S, N> {
         pixels.all(|pixel| *pixel == S::Pixel::default())
     }
 
+    /// Returns the sums of tier `row` in the sheet of `slot`, margins included.
     #[inline(always)]
     pub fn tier_mut(&mut self, slot: usize, row: usize) -> &mut [S::Pixel] {
         let Shape { rows, wide, .. } = self.shape;
@@ -299,7 +309,7 @@ fn firsts_of(columns: u64, n: usize) -> u64 {
     }
 }
 
-/// Sums whose tiers are added to and folded in lanes.
+/// A kind of sums whose tiers are added to and folded in lanes.
 pub trait Tiered: Recorded {
     /// Adds `voxels` with `payloads`, which begin at the sheet that `slot` holds, to the tiers that
     /// their rows name.

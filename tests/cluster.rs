@@ -154,8 +154,8 @@ async fn killed_with_a_tile(schedule: &str) {
     }
 }
 
-/// Single frames on more threads than there are tiles to share out evenly: after the first frames have
-/// taught the master what tiles cost, it splits some before they are drawn.
+/// Single frames on more threads than there are tiles to share out evenly: after the first frames
+/// have taught the master what tiles cost, it splits some before they are drawn.
 #[tokio::test]
 async fn split_tiles_of_a_sole_frame_cost_no_pixel() {
     let dir = tempfile::tempdir().expect("a folder");

@@ -1,13 +1,13 @@
 //! Runs the commands that the documents show, and follows their links.
 //!
-//! Every fenced block of README.md, deploy/README.md and docs/ that is marked `sh` is read. Lines that
-//! begin with `slabcast` (or `target/release/slabcast`, or `cargo run --release --`) run with the built
-//! program, in a scratch folder for each document, in the order in which they stand. So that a
-//! document takes a second, pictures are made small and paths short ([`shrink`]). A master that a
-//! document starts gets a free port, and later lines of the document call it there.
+//! Every fenced block of README.md, deploy/README.md and docs/ that is marked `sh` is read. Lines
+//! that begin with `slabcast` (or `target/release/slabcast`, or `cargo run --release --`) run with
+//! the built program, in a scratch folder for each document, in the order in which they stand. So
+//! that a document takes a second, pictures are made small and paths short ([`shrink`]). A master
+//! that a document starts gets a free port, and later lines of the document call it there.
 //!
-//! A block whose fence says `sh no-run: REASON` is not run, as it needs a machine, a volume or an hour
-//! that a test does not have. Its flags are parsed all the same: `--help` is added, which clap
+//! A block whose fence says `sh no-run: REASON` is not run, as it needs a machine, a volume or an
+//! hour that a test does not have. Its flags are parsed all the same: `--help` is added, which clap
 //! answers only if it understood what stands before it.
 
 use std::io::{BufRead, BufReader};

@@ -1,8 +1,8 @@
 //! One master, workers over every kind of link, one picture.
 //!
-//! The same job runs over the embedded link, over an embedded link with the codec of the wire
-//! in its middle, and over TCP with two connections a worker; each gives the bytes of the
-//! serial renderer. Nothing here sleeps to wait for something: channels say when.
+//! One job runs over the embedded link, over an embedded link with the codec of the wire in its
+//! middle, and over TCP with two connections a worker; each gives the bytes of the serial renderer.
+//! Nothing here sleeps to wait for something: channels say when.
 
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::{Background, PixelFormat};

@@ -9,9 +9,10 @@ fn root() -> PathBuf {
 
 /// The crates and what each may see (ARCHITECTURE.md). A new arrow is rare and argued for.
 ///
-/// `scene` is what a user asks for: presets, view paths, crops, requests. Whoever takes requests sees
-/// it: the wire, the master, the brick store, the client. The renderer never does, and the worker, the
-/// scheduler and the simulator in their tests alone: they get one frame's view and transfer function.
+/// `scene` is what a user asks for: presets, view paths, crops, requests. Whoever takes requests
+/// sees it: the wire, the master, the brick store, the client. The renderer never does, and the
+/// worker, the scheduler and the simulator in their tests alone: they get one frame's view and
+/// transfer function.
 const ARROWS: [(&str, &[&str]); 14] = [
     ("common", &[]),
     ("common/scene", &["common"]),

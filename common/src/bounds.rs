@@ -1,8 +1,9 @@
 //! Bounds on how far a picture can be from its own sheets in exact arithmetic: what the cut-off and
 //! the integers cost, at most, on any pixel.
 //!
-//! These are bounds, argued below, not estimates. They are in a frame's statistics, and `slabcast
-//! check` holds pictures against them. All are in 1/255. `within` is the box of the visible voxels.
+//! Each is a bound, argued below, not an estimate. Bounds are in a frame's statistics, and
+//! `slabcast check` holds pictures against them. All are in 1/255. `within` is the box of the
+//! visible voxels.
 
 use crate::brick::TightBox;
 use crate::kernel::{Lean, Profile};

@@ -1,5 +1,5 @@
-//! What a client asks of a picture ([`Quality`]) and of the work behind it ([`Work`], which never
-//! changes a byte). Names are those of docs/design/contracts.md, in flags, JSON and the wire.
+//! Settings of a client for a picture ([`Quality`]) and for the work behind it ([`Work`], which
+//! never changes a byte). Names are those of docs/design/contracts.md, in flags, JSON and the wire.
 
 use crate::spelling::nearest;
 use serde::{Deserialize, Serialize};

@@ -36,7 +36,8 @@ fn every_call_message_and_field_has_a_comment() {
         };
         for (i, message) in file.message_type.iter().enumerate() {
             check(&[4, i], message.name());
-            // Messages of slabcast.cluster.v1 that say that they mean what others mean, and vectors.
+            // Messages of slabcast.cluster.v1 that say that they mean what others mean, and
+            // vectors.
             let elsewhere = file.name().ends_with("cluster/v1/scene.proto");
             if elsewhere || message.name() == "Vec3" {
                 continue;

@@ -150,8 +150,8 @@ impl Stalls {
         }
     }
 
-    /// Removes a region that is done, failed, or of a frame that has ended. `touched`: places of the
-    /// bricks that it drew.
+    /// Removes a region that is done, failed, or of a frame that has ended. `touched`: places of
+    /// the bricks that it drew.
     pub(crate) fn remove(&mut self, key: RegionKey, touched: &[u32]) {
         let Some(region) = self.regions.remove(&key) else { return };
         self.clock += 1;
@@ -261,8 +261,8 @@ impl Stalls {
         requests
     }
 
-    /// Drops bricks that no region keeps until `bytes` more fit into the budget, and returns whether
-    /// they do. If they can't fit, nothing is dropped, unless it is urgent.
+    /// Drops bricks that no region keeps until `bytes` more fit into the budget, and returns
+    /// whether they do. If they can't fit, nothing is dropped, unless it is urgent.
     fn make_room(
         &mut self,
         cache: &mut BrickCache,

@@ -1,7 +1,7 @@
 //! `slabcast lab`: the laboratory, one subcommand an experiment.
 //!
-//! Until version 0.3 each experiment also runs under its old top-level name (`slabcast lab error`), which
-//! is hidden and says where it went.
+//! Until version 0.3 each experiment also runs under its old top-level name (`slabcast lab error`),
+//! which is hidden and says where it went.
 
 use slabcast_lab::{bench, check, error, explain, plan, replay, report, study};
 use slabcast_session::fail::Fail;

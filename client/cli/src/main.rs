@@ -1,9 +1,9 @@
 //! The `slabcast` program: what is typed, which command that is, and how it ended.
 //!
-//! [`mod@command`] lists the subcommands; each has a file of its own, but for those of the laboratory
-//! ([`lab`], crate `slabcast_lab`). [`config`] lays flags, environment and file over each other,
-//! [`usage`] says what is wrong with a command line, [`logging`] begins to log. What renders a request
-//! is in `slabcast_session`.
+//! [`mod@command`] lists the subcommands; each has a file of its own, but for those of the
+//! laboratory ([`lab`], crate `slabcast_lab`). [`config`] lays flags, environment and file over
+//! each other, [`usage`] says what is wrong with a command line, [`logging`] begins to log. What
+//! renders a request is in `slabcast_session`.
 //!
 //! This is the only crate that sees all others. It decides nothing about pixels and schedules.
 //! Results go to stdout, everything else to stderr; every failure is one line

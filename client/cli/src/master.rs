@@ -1,8 +1,8 @@
 //! `slabcast master`: serves a volume to workers and takes jobs from clients.
 //!
-//! Says READY to systemd, answers its watchdog, and on SIGTERM or Ctrl-C stops gracefully within ten
-//! seconds and ends with 0. Every flag has a variable of the environment ([`crate::config`]), so that
-//! a unit file needs none.
+//! Says READY to systemd, answers its watchdog, and on SIGTERM or Ctrl-C stops gracefully within
+//! ten seconds and ends with 0. Every flag has a variable of the environment ([`crate::config`]),
+//! so that a unit file needs none.
 
 use crate::systemd::{self, DRAIN};
 use slabcast_master::MasterConfig;
@@ -52,8 +52,8 @@ pub(crate) struct MasterArgs {
     /// Events and decisions of the scheduler, for `slabcast lab replay`; some 25 KB a frame
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Take workers that hold tiles for recorded times (`slabcast worker --rehearse`), and no others;
-    /// pictures are marked all over
+    /// Take workers that hold tiles for recorded times (`slabcast worker --rehearse`), and no
+    /// others; pictures are marked all over
     #[arg(long, value_parser = clap::builder::FalseyValueParser::new())]
     rehearse: bool,
 }

@@ -1,9 +1,11 @@
-//! The hidden `slabcast read-dicom`: parses DICOM for another process of this program, within limits.
+//! The hidden `slabcast read-dicom`: parses DICOM for another process of this program, within
+//! limits.
 
 use slabcast_session::fail::Fail;
 use std::path::PathBuf;
 
-/// Parses a folder of DICOM for another process of ours, within limits: series and samples to stdout.
+/// Parses a folder of DICOM for another process of ours, within limits: series and samples to
+/// stdout.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:

@@ -9,9 +9,9 @@ use std::path::PathBuf;
 
 /// Renders a picture again from the record inside it.
 ///
-/// Then compares the two files. Pictures that slabcast writes (PNG of 8 or 16 bits, EXR, moving PNG) say what made them: the
-/// volume's digest, transfer function, view, quality and version. With the same volume the new
-/// file has the same bytes, on any machine.
+/// Then compares the two files. Pictures that slabcast writes (PNG of 8 or 16 bits, EXR, moving
+/// PNG) say what made them: the volume's digest, transfer function, view, quality and version. With
+/// the same volume the new file has the same bytes, on any machine.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:

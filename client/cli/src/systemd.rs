@@ -1,5 +1,5 @@
-//! What `master` and `worker` tell systemd (sd_notify), where it listens, and how long they may take
-//! to stop.
+//! Integration with systemd: what `master` and `worker` report to it (sd_notify), the sockets it
+//! listens on, and the time that they have to stop.
 
 use slabcast_master::Handle;
 use std::time::Duration;

@@ -14,8 +14,8 @@ use std::path::PathBuf;
 
 /// Writes a transfer function as JSON, to change by hand.
 ///
-/// A preset or map fitted to a volume, or a file of ours or of ParaView's, with what flags change of
-/// it.
+/// A preset or map fitted to a volume, or a file of ours or of ParaView's, with what flags change
+/// of it.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:

@@ -39,8 +39,8 @@ fn one_sentence(text: &str, typed: &[String]) -> String {
     };
     for line in text.lines().map(str::trim).filter(|l| !l.is_empty()) {
         if let Some(usage) = line.strip_prefix("Usage: ") {
-            // `slabcast render [OPTIONS] ...`: the program, whatever it is called here, and the words before
-            // the first that is no name.
+            // `slabcast render [OPTIONS] ...`: the program, whatever it is called here, and the
+            // words before the first that is no name.
             let name = |w: &&str| w.chars().all(|c| c.is_ascii_lowercase());
             let mut words = usage.split_whitespace();
             help = words.next().unwrap_or("slabcast").to_string();

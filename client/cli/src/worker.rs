@@ -42,8 +42,8 @@ pub(crate) struct WorkerArgs {
     #[arg(long, value_name = "BYTES", default_value = "512MiB",
           value_parser = parse::memory)]
     memory: u64,
-    /// Draw nothing, but hold each tile for the time that this file of `slabcast lab plan --trace` says; for
-    /// a master with --rehearse
+    /// Draw nothing, but hold each tile for the time that this file of `slabcast lab plan --trace`
+    /// says; for a master with --rehearse
     #[arg(long, value_name = "TRACE")]
     rehearse: Option<PathBuf>,
 }

@@ -1,6 +1,6 @@
 //! A master and its workers inside this process.
 //!
-//! They speak the same messages as over a network, through channels; the scheduler can't tell
+//! Master and workers exchange the messages of a network through channels; the scheduler can't tell
 //! (docs/design/cluster.md section 2). Bricks are shared, not copied.
 
 use crate::fail::Fail;

@@ -1,16 +1,16 @@
-//! Rendering sessions, shared by the command and its laboratory: a request is rendered by an embedded
-//! cluster or by a remote master, and its pictures are written.
+//! Rendering sessions, shared by the command and its laboratory: a request is rendered by an
+//! embedded cluster or by a remote master, and its pictures are written.
 //!
-//! - [`request`] turns flags and files into a request; [`volume`] opens its volume, [`transfer`] its
-//!   colours and opacities, [`parse`] single values.
-//! - [`embedded`] renders it by a master and workers in this process, [`remote`] by a cluster behind
-//!   a network; both deliver frames through a [`source`]. [`direct`] draws on threads alone, without
-//!   master or scheduler, the frames that [`path_scenes`] prepares.
+//! - [`request`] turns flags and files into a request; [`volume`] opens its volume, [`transfer`]
+//!   its colours and opacities, [`parse`] single values.
+//! - [`embedded`] renders it by a master and workers in this process, [`remote`] by a cluster
+//!   behind a network; both deliver frames through a [`source`]. [`direct`] draws on threads alone,
+//!   without master or scheduler, the frames that [`path_scenes`] prepares.
 //! - [`output`] writes frames to files or pipes and says in each picture what made it.
 //! - [`progress`], [`terminal`], [`signals`] and [`fail`] are a command's manners: what a person
 //!   sees meanwhile, and how it ends.
 //!
-//! It decides nothing about pixels and schedules.
+//! This crate decides nothing about pixels and schedules.
 
 pub mod canvas;
 pub mod direct;

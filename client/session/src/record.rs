@@ -1,4 +1,5 @@
-//! `--record`: a scheduler's events and decisions, written to a file that `slabcast lab replay` reads.
+//! `--record`: a scheduler's events and decisions, written to a file that `slabcast lab replay`
+//! reads.
 //!
 //! A record grows under FILE.part and gets its name when its last line is written: a master that
 //! is killed leaves FILE.part, which replays as far as it goes.

@@ -1,4 +1,4 @@
-//! Where frames come from: a job's updates, of a cluster in this process or behind a network.
+//! Sources of frames: the updates of a job, from a cluster in this process or over a network.
 
 use crate::fail::Fail;
 use crate::output::Frame;

@@ -1,5 +1,4 @@
-//! Which values have which colour and opacity: a preset, a map or a file, and what flags change of
-//! it.
+//! The user's transfer function: a preset, a map or a file, and the changes that flags make to it.
 
 use crate::fail::Fail;
 use crate::parse;
@@ -22,8 +21,8 @@ const MAX_JSON_BYTES: u64 = 64 << 20;
 pub struct TransferFlags {
     /// Colours of a colour map or ParaView file instead
     ///
-    /// viridis, inferno, magma, plasma, cividis, turbo, cool-warm, greys, or a ParaView file; spread
-    /// over the values that the transfer function shows.
+    /// viridis, inferno, magma, plasma, cividis, turbo, cool-warm, greys, or a ParaView file;
+    /// spread over the values that the transfer function shows.
     #[arg(long, value_name = "MAP|FILE")]
     colors: Option<String>,
     /// Where light comes from: head (the eye), or a direction in world axes

@@ -84,8 +84,8 @@ impl InputArgs {
     }
 }
 
-/// This program as it parses DICOM for another of its processes (`slabcast read-dicom`). Where the system
-/// doesn't say which file we are, a thread has to do.
+/// This program as it parses DICOM for another of its processes (`slabcast read-dicom`). Where the
+/// system doesn't say which file we are, a thread has to do.
 fn dicom_reader() -> Option<Vec<OsString>> {
     let program = std::env::current_exe().ok()?;
     Some(vec![program.into(), "read-dicom".into()])

@@ -1,4 +1,4 @@
-//! What a user asks for, before it is cut into work: transfer functions by name and between keys,
+//! The request of a user, before it is cut into work: transfer functions by name and between keys,
 //! colour maps, view paths, cropping boxes, the bricks that a job needs, and the job's request.
 //!
 //! The command, the client, the master and the wire share this crate. Workers and the renderer

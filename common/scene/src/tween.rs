@@ -4,11 +4,11 @@
 //! colours in linear light. Both are piecewise linear, so their mean is too, with the points of
 //! both. The ends are the functions themselves, bit for bit.
 //!
-//! What is visible in between is visible at one of the ends: where both opacities are zero, so is
-//! every mean of them. So the bricks of a path are those of the union of its functions' supports
-//! ([`Tween::key_functions`]), and no frame of it needs a brick more. A voxel that a frame holds
-//! and does not see has an extinction of zero and adds nothing: the frame is that of a job of its
-//! own, to the byte.
+//! A value that is visible in between is visible at one of the ends: where both opacities are zero,
+//! so is every mean of them. So the bricks of a path are those of the union of its functions'
+//! supports ([`Tween::key_functions`]), and no frame of it needs a brick more. A voxel that a frame
+//! holds and does not see has an extinction of zero and adds nothing: the frame is that of a job of
+//! its own, to the byte.
 
 use crate::path::{KeyFrames, ViewPath};
 use crate::presets;

@@ -1,12 +1,14 @@
-//! The roof over adding: bytes a second that one thread reads, adds to and writes back, in memory of some sizes.
+//! The roof over adding: bytes a second that one thread reads, adds to and writes back, in memory
+//! of some sizes.
 //!
 //! ```text
 //! rustc -O roof.rs && ./roof 16384 135168      sizes in bytes
 //! ```
 //!
-//! What is done to a register is what a voxel does to a pixel's 16-bit sums (a load, a product, a sum that saturates,
-//! a store), in registers as wide as the machine has, one after the other. `docs/measurements/scripts/roofline.py` compiles and runs it
-//! and compares with what a frame reaches. Prints JSON: bytes read and written a second, in GB, by size.
+//! Each register gets the operations that a voxel does on a pixel's 16-bit sums (a load, a product,
+//! a sum that saturates, a store), in registers as wide as the machine has, one after the other.
+//! `docs/measurements/scripts/roofline.py` compiles and runs it and compares with what a frame
+//! reaches. Prints JSON: bytes read and written a second, in GB, by size.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};

@@ -1,7 +1,7 @@
 //! Rules for the scheduler's constants.
 //!
-//! Every constant of the deciding rooms says in its first word what it is: `Tuning`, with its unit in
-//! brackets, for a figure that was measured and could be another; `Limit` for an array bound, a
+//! Every constant of the deciding rooms says in its first word what it is: `Tuning`, with its unit
+//! in brackets, for a figure that was measured and could be another; `Limit` for an array bound, a
 //! protocol's figure or a guard. Tuning constants are few, so that someone can keep them in mind.
 
 use std::collections::BTreeMap;

@@ -1,4 +1,4 @@
-//! What planning costs the master: `cargo test --release -p slabcast-schedule --test cost --
+//! Time that planning takes the master: `cargo test --release -p slabcast-schedule --test cost --
 //! --nocapture --include-ignored` prints it. A slab's planning is on the critical path of every
 //! frame (nothing is rendered meanwhile), so it has to stay far below a slab's rendering.
 

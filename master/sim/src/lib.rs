@@ -27,8 +27,8 @@
 //!   [`Incident`]s and from a seed. A [`TileModel`] that draws real pixels shows whether pictures
 //!   are whole, and [`Audit`] whether the scheduler keeps its promises.
 //!
-//! It refuses to know what is in a picture, and where times come from. It leaves out: lost packets,
-//! other traffic, memory that cores share, and slow disks.
+//! The simulation refuses to know what is in a picture, and where times come from. It leaves out
+//! lost packets, other traffic, memory that cores share, and slow disks.
 
 mod audit;
 mod cluster;

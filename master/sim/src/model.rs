@@ -1,4 +1,5 @@
-//! Tile models, the costs of tiles and the contents of their results: the part of a simulation that knows pictures.
+//! Tile models, the costs of tiles and the contents of their results: the part of a simulation that
+//! knows pictures.
 
 use crate::Unpredictable;
 use slabcast_common::image::TilePixels;

@@ -1,4 +1,4 @@
-//! What the scheduler's own decisions take, by hand: a ball is drawn by many workers.
+//! Time of the scheduler's own decisions, measured by hand: many workers draw a ball.
 //!
 //! `slabcast plan` measures the same on a path that was drawn; here nothing has to be.
 

@@ -456,8 +456,8 @@ fn from_hex(text: &str) -> Option<Vec<u8>> {
     bytes.chunks_exact(2).map(|p| Some(digit(p[0])? << 4 | digit(p[1])?)).collect()
 }
 
-/// Returns an event without its pixels; `None` for a queued frame, whose scene and bricks are written
-/// once. `is_shut` tells of a pixel of a result whether it is shut.
+/// Returns an event without its pixels; `None` for a queued frame, whose scene and bricks are
+/// written once. `is_shut` tells of a pixel of a result whether it is shut.
 fn noted(event: &Event, is_shut: impl Fn(&TileResult, f32) -> bool) -> Option<Noted> {
     let set = |key: &slabcast_common::brick::BrickSetKey| key.0.to_string();
     Some(match event {

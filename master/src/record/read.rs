@@ -143,8 +143,8 @@ struct Seen {
     now: Micros,
 }
 
-/// Hands the events of a record to a new scheduler and compares its decisions with the recorded ones,
-/// until the first difference.
+/// Hands the events of a record to a new scheduler and compares its decisions with the recorded
+/// ones, until the first difference.
 ///
 /// # Errors
 /// If a line is not as the recorder writes it, or reading fails.

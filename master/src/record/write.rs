@@ -48,8 +48,9 @@ pub struct RecordSummary {
     pub cut: Option<String>,
 }
 
-/// Starts a thread that writes a record to `out`. The thread ends when the master that was given the
-/// [`Recorder`] has ended, and returns the record's summary, or the error of a write that failed.
+/// Starts a thread that writes a record to `out`. The thread ends when the master that was given
+/// the [`Recorder`] has ended, and returns the record's summary, or the error of a write that
+/// failed.
 ///
 /// # Errors
 /// If the system gives no thread.
@@ -286,8 +287,8 @@ impl RecordedScheduler {
 }
 
 impl Drop for RecordedScheduler {
-    /// Writes the last line, which says that the record is whole. Decisions that a master which ends
-    /// did not carry out are in it.
+    /// Writes the last line, which says that the record is whole. Decisions that a master which
+    /// ends did not carry out are in it.
     fn drop(&mut self) {
         if self.tape.is_some() {
             while self.next_action().is_some() {}

@@ -270,8 +270,9 @@ async fn prefetch_requests_bricks_before_their_region_is_begun() {
     assert_eq!(result.region.map(|cost| cost.touched), Some(vec![0, 1]));
 }
 
-/// Seen from the side, one brick begins eight sheets behind the other. In a scene's first frame each
-/// is requested when drawing comes to it; later, as the thread has waited for bricks, both together.
+/// Seen from the side, one brick begins eight sheets behind the other. In a scene's first frame
+/// each is requested when drawing comes to it; later, as the thread has waited for bricks, both
+/// together.
 #[tokio::test]
 async fn lookahead_grows_while_render_threads_wait_for_bricks() {
     let mut world = World::new().await;

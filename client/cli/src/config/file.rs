@@ -17,7 +17,8 @@ pub(crate) struct File {
     table: toml::Table,
 }
 
-/// Returns the path of the user's own file: `$XDG_CONFIG_HOME/slabcast/slabcast.toml`, or below `~/.config`.
+/// Returns the path of the user's own file: `$XDG_CONFIG_HOME/slabcast/slabcast.toml`, or below
+/// `~/.config`.
 pub(crate) fn own() -> Option<PathBuf> {
     let of = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
     let base = of("XDG_CONFIG_HOME").or_else(|| of("HOME").map(|home| home.join(".config")))?;

@@ -3,10 +3,10 @@
 //!
 //! A flag beats a variable of the environment, that beats the file, and that beats the default.
 //! Every flag has its variable (`--tiles-per-thread`: SLABCAST_TILES_PER_THREAD) and its key
-//! (`tiles-per-thread` under the command's name); aliases of a flag have theirs. The lower three are one thing to clap: what the
-//! environment and the file say becomes the default of an argument before the command line is
-//! parsed. So each value is checked by the parser of its flag, whoever gave it, and a command's
-//! code does not know that there are layers.
+//! (`tiles-per-thread` under the command's name); aliases of a flag have theirs. The lower three
+//! are one thing to clap: what the environment and the file say becomes the default of an argument
+//! before the command line is parsed. So each value is checked by the parser of its flag, whoever
+//! gave it, and a command's code does not know that there are layers.
 //!
 //! A flag also silences what it excludes: `--azimuth 30` is not refused because of `frames` in a
 //! file. Within one layer such a pair is a mistake and is named.

@@ -1,9 +1,9 @@
 //! `slabcast render --show`: pictures of how a picture came about.
 //!
 //! Depth, work and sheets are the serial renderer's notes about each pixel
-//! ([`slabcast_render::oracle::work_counters`]), the error is an estimate from sheets of half the thickness, and
-//! tiles with their owners are in a frame's statistics. Each is drawn over the same view as the
-//! frame would be, with a legend below that says what the colours mean.
+//! ([`slabcast_render::oracle::work_counters`]), the error is an estimate from sheets of half the
+//! thickness, and tiles with their owners are in a frame's statistics. Each is drawn over the same
+//! view as the frame would be, with a legend below that says what the colours mean.
 
 use slabcast_common::image::{Picture, PixelFormat};
 use slabcast_common::quality::{Compositing, Quality};
@@ -189,8 +189,8 @@ fn counted(picture: &Picture, counts: &[u32], title: &str) -> Canvas {
     board(size(picture), colours, &legend)
 }
 
-/// Estimates the error of each pixel from the thickness of sheets, in 1/255: from the difference to sheets
-/// of half the thickness. Where the error falls with the square of the thickness, the finer
+/// Estimates the error of each pixel from the thickness of sheets, in 1/255: from the difference to
+/// sheets of half the thickness. Where the error falls with the square of the thickness, the finer
 /// picture has a quarter of it left, so that the whole is 4/3 of the difference; the linear rule
 /// does better and is overrated by a quarter at most. The paper's rule has an error of first order
 /// (to a limit of its own): twice the difference.

@@ -1,5 +1,5 @@
-//! What a master in this process takes: `render` beside threads that draw the same path without one, both to
-//! the same files.
+//! Cost of a master in this process: times `render`, and threads that draw the path without a
+//! master, both to the same files.
 
 use super::*;
 use slabcast_common::image::Picture;
@@ -62,8 +62,9 @@ async fn told(run: &mut Run, volume: Arc<Volume>, orientation: Orientation) -> B
     }
 }
 
-/// Threads that share the tiles of one frame after the other. Another encodes what is drawn meanwhile, and
-/// what comes out is written as `render` does, with the provenance of a frame of which all else is `told`.
+/// Threads that share the tiles of one frame after the other. Another encodes what is drawn
+/// meanwhile, and what comes out is written as `render` does, with the provenance of a frame of
+/// which all else is `told`.
 async fn plain(
     mut run: Run,
     volume: Arc<Volume>,

@@ -98,8 +98,8 @@ pub(crate) struct RenderArgs {
     show: Option<DebugView>,
     /// Statistics, one line of JSON a frame; - is stdout
     ///
-    /// For their estimates of errors one pixel in 128 is drawn again in other ways: up to a quarter more
-    /// time.
+    /// For their estimates of errors one pixel in 128 is drawn again in other ways: up to a quarter
+    /// more time.
     #[arg(long, value_name = "FILE|-", help_heading = "Output")]
     stats: Option<PathBuf>,
     /// Statistics without the hash of the linear picture

@@ -13,8 +13,8 @@ use slabcast_session::fail::Fail;
 use std::sync::Arc;
 use tokio::runtime::Runtime;
 
-/// Chooses the quality for a target: errors by the reference, times by a cluster of this process. The
-/// cluster then renders, since it has the bricks.
+/// Chooses the quality for a target: errors by the reference, times by a cluster of this process.
+/// The cluster then renders, since it has the bricks.
 pub(super) fn choose_here(
     run: &mut Run,
     volume: &Arc<Volume>,

@@ -1,5 +1,5 @@
-//! What docs/reference/transfer-functions.md promises, by the program itself: its example files are
-//! drawn, names and ranges mean what they say, files for ParaView come back.
+//! Promises of docs/reference/transfer-functions.md, held by the program itself: its example files
+//! are drawn, names and ranges mean what they say, files for ParaView come back.
 
 use crate::program::{run, slabcast};
 use slabcast_common::stats::FrameStats;

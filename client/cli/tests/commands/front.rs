@@ -1,5 +1,5 @@
-//! `slabcast lab report`, `--error` and `--budget` as a user runs them: figures that are what they say,
-//! words that are kept.
+//! `slabcast lab report`, `--error` and `--budget` as a user runs them: figures that are what they
+//! say, words that are kept.
 
 use crate::program::{Process, master, slabcast};
 use serde_json::Value;
@@ -180,8 +180,8 @@ fn error_target_is_kept_on_a_cluster() {
     assert!(quality["thickness"].as_f64().unwrap() <= 0.25, "all the time in the world: {quality}");
 }
 
-/// What a frame's statistics say of errors, beside the reference's word: estimates of RMSE, and bounds that
-/// hold on every pixel.
+/// What a frame's statistics say of errors, beside the reference's word: estimates of RMSE, and
+/// bounds that hold on every pixel.
 #[test]
 fn statistics_contain_error_estimates_by_source() {
     let dir = tempfile::tempdir().unwrap();

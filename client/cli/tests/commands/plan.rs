@@ -49,7 +49,8 @@ fn plan_separates_measured_from_predicted() {
     for row in plan["predicted"].as_array().unwrap() {
         let n = |key: &str| row[key].as_f64().unwrap();
         assert!(n("frame_ms") > 0.0 && n("first_ms") > 0.0 && n("bytes_up") > 0.0, "{row}");
-        // Nobody is faster than all cores, but for what two measurements differ by on a busy machine.
+        // Nobody is faster than all cores, but for what two measurements differ by on a busy
+        // machine.
         assert!(n("latency_efficiency") <= 1.5, "{row}");
         let named = ["cores", "straggler", "link", "master"];
         assert!(named.contains(&row["bound_by"].as_str().unwrap()), "{row}");

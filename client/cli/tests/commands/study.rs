@@ -1,4 +1,5 @@
-//! `slabcast lab study`: what it writes, that its figures agree with each other, and what it refuses.
+//! `slabcast lab study`: what it writes, that its figures agree with each other, and what it
+//! refuses.
 
 use crate::program::{good, names, run, text};
 use serde_json::Value;
@@ -86,7 +87,8 @@ fn study_tables_and_charts_agree() {
                 && r["nodes"] == nodes
         })
     };
-    // Alone, rendering is all there is at the paper's pace: tiles of three slabs against the best cut.
+    // Alone, rendering is all there is at the paper's pace: tiles of three slabs against the best
+    // cut.
     let alone = of("predicted", "paper", Some(3), 2).expect("one rendering node");
     let one = n(&alone["speed_up"]);
     assert!((0.3..1.3).contains(&one), "{one}");
@@ -95,7 +97,8 @@ fn study_tables_and_charts_agree() {
         for slabs in [Some(3), Some(5), None] {
             let run = of("predicted", "paper", slabs, nodes).expect("all of the paper's");
             let speed_up = n(&run["speed_up"]);
-            // Nobody is faster than all rendering nodes; tiles that were timed twice differ a little.
+            // Nobody is faster than all rendering nodes; tiles that were timed twice differ a
+            // little.
             assert!(speed_up < 1.3 * (nodes - 1) as f64, "{nodes}: {speed_up}");
             assert!((n(&run["ratio"]) * nodes as f64 - speed_up).abs() < 1e-9);
         }

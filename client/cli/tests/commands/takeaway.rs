@@ -1,5 +1,5 @@
-//! What people take away: pictures of every format that can be made again, moving ones, video in a
-//! pipe, and what becomes of them when the disk is full or Ctrl-C is pressed.
+//! Results that people keep: pictures of every format that can be made again, moving ones, video in
+//! a pipe, and what becomes of them when the disk is full or Ctrl-C is pressed.
 
 use crate::program::{end, good, names, run, signal, slabcast, text};
 use std::io::{Read, Write};

@@ -1,7 +1,7 @@
-//! Thin sheets come to the limit: a thickness of 1/16 vox, sums of i32 and no cut-off agree with the
-//! reference within 0.05/255 RMSE, which is what is promised. A window at the centre of the
-//! pictures of docs/measurements/accuracy.md, at their scale of 1.6 pixels a vox: where
-//! positions are rounded, an error follows the scale and not the size.
+//! Thin sheets come to the limit: a thickness of 1/16 vox, sums of i32 and no cut-off agree with
+//! the reference within 0.05/255 RMSE, which is what is promised. A window at the centre of the
+//! pictures of docs/measurements/accuracy.md, at their scale of 1.6 pixels a vox: where positions
+//! are rounded, an error follows the scale and not the size.
 
 use std::io::Write;
 use std::path::Path;

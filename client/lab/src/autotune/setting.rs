@@ -9,7 +9,8 @@ use slabcast_common::quality::{Kernel, Quality, Sums};
 pub struct Setting {
     /// Quality at which the picture is drawn.
     pub(crate) quality: Quality,
-    /// Factor by which each edge of the picture is drawn smaller before it is magnified (1 or more).
+    /// Factor by which each edge of the picture is drawn smaller before it is magnified (1 or
+    /// more).
     pub(crate) shrink: u32,
     /// Whether voxels are shaded, in a scene with shading.
     pub(crate) shaded: bool,

@@ -1,7 +1,7 @@
 //! The processor time of messages.
 //!
-//! It has two parts. Converting pixels to messages and back is timed here. The time of gRPC, TCP
-//! and the kernel follows from the pings of the machine that drew the tiles
+//! The time has two parts. Converting pixels to messages and back is timed here. The time of gRPC,
+//! TCP and the kernel follows from the pings of the machine that drew the tiles
 //! ([`pings`](super::pings)).
 
 use super::clock::cpu_ns;

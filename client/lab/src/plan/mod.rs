@@ -1,10 +1,10 @@
 //! `slabcast lab plan`: predicts the frame times of a cluster that does not exist yet.
 //!
-//! Measured and predicted figures are kept apart in the output. `measure` draws every tile of the path here, on
-//! one core, and sizes its messages. `predict` runs the scheduler itself with these tiles against
-//! virtual workers and links (`slabcast_sim`). `costs` has the processor time of messages, from
-//! the `pings` measured here. `chart` draws the prediction. `rehearse` tests it with real
-//! processes on this machine.
+//! Measured and predicted figures are kept apart in the output. `measure` draws every tile of the
+//! path here, on one core, and sizes its messages. `predict` runs the scheduler itself with these
+//! tiles against virtual workers and links (`slabcast_sim`). `costs` has the processor time of
+//! messages, from the `pings` measured here. `chart` draws the prediction. `rehearse` tests it with
+//! real processes on this machine.
 
 mod chart;
 pub(crate) mod clock;

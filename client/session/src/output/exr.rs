@@ -1,10 +1,9 @@
 //! OpenEXR: linear premultiplied RGBA in 32-bit floats, before any background.
 //!
-//! These are the numbers that the frame's hash is of, and what compositing programs expect: EXR's
-//! colours are linear and premultiplied by definition. The writer is our own: single-part
-//! scanlines in blocks of 16 lines, ZIP, are 100 lines over the zlib that is here already. The
-//! `exr` crate would bring a reader that aborts on some broken files, half floats, tiles and eight
-//! more crates for them.
+//! A frame's hash is of these numbers, and compositing programs expect them: EXR's colours are
+//! linear and premultiplied by definition. The writer is our own: single-part scanlines in blocks
+//! of 16 lines, ZIP, are 100 lines over the zlib that is here already. The `exr` crate would bring
+//! a reader that aborts on some broken files, half floats, tiles and eight more crates for them.
 
 use super::Frame;
 use slabcast_common::image::PixelFormat;

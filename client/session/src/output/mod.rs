@@ -128,14 +128,14 @@ impl Format {
 pub struct OutputArgs {
     /// Folder for frame_0000.png and so on, or one file
     ///
-    /// A folder is made if missing. NAME.png or NAME.exr has one frame, NAME.apng or NAME.y4m all of
-    /// them; - writes Y4M video to stdout.
+    /// A folder is made if missing. NAME.png or NAME.exr has one frame, NAME.apng or NAME.y4m all
+    /// of them; - writes Y4M video to stdout.
     #[arg(short, long, value_name = "DIR|FILE|-", default_value = "slabcast-out/")]
     pub output: PathBuf,
     /// png, png16, exr, apng or y4m [default: by the name of -o]
     ///
-    /// png16 has 16 bits, exr linear floats and no background; apng and y4m are one moving picture. A
-    /// folder gets png by default.
+    /// png16 has 16 bits, exr linear floats and no background; apng and y4m are one moving picture.
+    /// A folder gets png by default.
     #[arg(long, value_name = "FORMAT", hide_possible_values = true, value_enum)]
     pub format: Option<Format>,
     /// Frames a second of a moving picture

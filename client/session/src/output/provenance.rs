@@ -1,4 +1,5 @@
-//! Provenance of a picture, as JSON inside its file: all that `slabcast rerender` needs beside the volume.
+//! Provenance of a picture, as JSON inside its file: all that `slabcast rerender` needs beside the
+//! volume.
 //!
 //! Nothing in it says who, where or when: a picture of a patient that is passed on tells the
 //! volume's digest and no name, and the same picture made elsewhere has the same bytes.

@@ -1,7 +1,7 @@
 //! The flags of a request: views, picture, quality and work.
 //!
-//! The first paragraph of a flag's help is the line that `-h` shows; what few need shows in `--help`
-//! alone.
+//! The first paragraph of a flag's help is the line that `-h` shows; what few need shows in
+//! `--help` alone.
 
 use super::{KeepArgs, RenderRequest};
 use crate::fail::Fail;
@@ -36,7 +36,8 @@ pub struct AxisArgs {
     pub up: Option<Axis>,
     /// World axis that faces the eye at azimuth 0 [default: +y]
     ///
-    /// +z where up lies along y; -y of a CT whose file has no anatomical axes, as slices are stored.
+    /// +z where up lies along y; -y of a CT whose file has no anatomical axes, as slices are
+    /// stored.
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true, hide_short_help = true)]
     pub front: Option<Axis>,
 }
@@ -83,8 +84,8 @@ pub struct ViewArgs {
     azimuth: Option<f64>,
     /// One frame from a side: anterior, left, superior, ...
     ///
-    /// anterior, left, superior, posterior, right or inferior. Where the file has no anatomical axes,
-    /// --front is anterior and --up superior.
+    /// anterior, left, superior, posterior, right or inferior. Where the file has no anatomical
+    /// axes, --front is anterior and --up superior.
     #[arg(long, value_name = "SIDE", value_parser = words(&Side::NAMES),
           hide_possible_values = true,
           conflicts_with_all = ["start", "step", "frames", "azimuth", "elevation"])]
@@ -118,7 +119,8 @@ pub struct ViewArgs {
     pub path: Option<PathBuf>,
     /// Draw only what lies in a box, such as -40:40,:,50:
     ///
-    /// FROM:TO along x, y and z, in mm or in percent of the volume's box; an empty end does not crop.
+    /// FROM:TO along x, y and z, in mm or in percent of the volume's box; an empty end does not
+    /// crop.
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
     crop: Option<Crop>,
 }
@@ -129,9 +131,9 @@ pub struct ViewArgs {
 pub struct PictureArgs {
     /// Transfer function: a preset, colour map or JSON file
     ///
-    /// A preset (auto, skin, bone, vessels, ...), a colour map (viridis, ...) or a JSON file, ours or
-    /// ParaView's. `slabcast tf --list` has all names, `slabcast info VOLUME` shows what each preset
-    /// would draw.
+    /// A preset (auto, skin, bone, vessels, ...), a colour map (viridis, ...) or a JSON file, ours
+    /// or ParaView's. `slabcast tf --list` has all names, `slabcast info VOLUME` shows what each
+    /// preset would draw.
     #[arg(long, value_name = "NAME|FILE", default_value = "auto")]
     tf: String,
     #[command(flatten)]
@@ -364,7 +366,8 @@ pub struct WorkArgs {
     schedule: Schedule,
     /// Where slabs of the slab schedule end
     ///
-    /// data: where what hides the rest has been passed; equal: all of one thickness, as in the paper.
+    /// data: where what hides the rest has been passed; equal: all of one thickness, as in the
+    /// paper.
     #[arg(long, default_value = "data", value_name = "NAME", hide_short_help = true,
           value_parser = words(&[("data", Borders::Data), ("equal", Borders::Equal)]))]
     slab_borders: Borders,

@@ -7,8 +7,8 @@ use slabcast_common::quality::Keep;
 pub struct KeepArgs {
     /// Keep what the scene does not need: empty, normals, gradients, colours
     ///
-    /// To see what leaving it out saves. In bricks: empty (voxels that nothing shows), normals (that
-    /// nothing shades), gradients (that modulate nothing); of a grey scene all three colours.
+    /// To see what leaving it out saves. In bricks: empty (voxels that nothing shows), normals
+    /// (that nothing shades), gradients (that modulate nothing); of a grey scene all three colours.
     #[arg(
         long,
         value_name = "WHAT,...",

@@ -1,8 +1,8 @@
 //! From flags and files to a request: views, colours, quality, work.
 //!
-//! Names are those of the contracts (docs/design/contracts.md). What can be refused without the volume
-//! is refused before anything is read or dialled ([`SceneArgs::request`]); what needs the lattice is
-//! refused by [`RenderRequest::fit`], which names the flag, or the file and its field.
+//! Names are those of the contracts (docs/design/contracts.md). What can be refused without the
+//! volume is refused before anything is read or dialled ([`SceneArgs::request`]); what needs the
+//! lattice is refused by [`RenderRequest::fit`], which names the flag, or the file and its field.
 
 mod flags;
 mod keep;
@@ -91,8 +91,8 @@ impl RenderRequest {
         }
     }
 
-    /// Checks that all of it can be drawn of this volume; `anatomical` says whether the volume's file
-    /// has anatomical axes.
+    /// Checks that all of it can be drawn of this volume; `anatomical` says whether the volume's
+    /// file has anatomical axes.
     ///
     /// # Errors
     /// A flag or a field of a file doesn't fit the volume; the error names it.
@@ -146,7 +146,8 @@ impl RenderRequest {
         Ok(())
     }
 
-    /// Returns a refusal that names where the user wrote what is refused: a flag, or a field of a file.
+    /// Returns a refusal that names where the user wrote what is refused: a flag, or a field of a
+    /// file.
     pub fn blame(&self, refused: &InvalidField) -> Fail {
         const FLAGS: [&str; 24] = [
             "thickness",

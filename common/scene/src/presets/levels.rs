@@ -7,9 +7,9 @@
 //! eye finds it: at the foot of the background's peak, or in the valley behind it if there is one.
 //!
 //! 1. The background is the fullest bin; its foot is where counts have fallen to a hundredth, or,
-//!    where a hill rises before that, in the middle of the valley's floor. (Noise around the body of
-//!    an MR falls off slowly and is still above a hundredth where the body begins: the foot would be
-//!    behind nearly all of it.)
+//!    where a hill rises before that, in the middle of the valley's floor. (Noise around the body
+//!    of an MR falls off slowly and is still above a hundredth where the body begins: the foot
+//!    would be behind nearly all of it.)
 //! 2. Behind the foot, the smoothed histogram has valleys. Of those with half of the foreground
 //!    above them the deepest counts (half: so that leaves are not cut off with the air because the
 //!    trunk is denser). There the content is *solid*: a surface can be drawn.

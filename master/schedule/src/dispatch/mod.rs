@@ -1,4 +1,4 @@
-//! Which worker is lent which task, and when: leases, work stealing and speculative copies.
+//! Dispatch of tasks to workers: leases, work stealing and speculative copies.
 
 pub(crate) mod lend;
 pub(crate) mod speculate;

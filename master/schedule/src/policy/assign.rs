@@ -1,4 +1,4 @@
-//! Which worker draws which tile of a frame (`region` schedule).
+//! Assignment of a frame's tiles to workers (`region` schedule).
 //!
 //! In the first frame each worker gets a band of rows: bricks at a border are sent to both sides,
 //! and when a path turns about the upright axis, bricks stay in their rows. From then on a tile

@@ -1,5 +1,5 @@
-//! Costs known from earlier frames of a picture: the rendering time, the owner and the bricks of each
-//! leaf of 16x16 pixels, and how fast each worker is.
+//! Costs known from earlier frames of a picture: the rendering time, the owner and the bricks of
+//! each leaf of 16x16 pixels, and how fast each worker is.
 //!
 //! Consecutive frames of a path are cut differently: a tile of 64 pixels in one is four of 32 in
 //! the next, and pieces of either may be rendered elsewhere. So costs are kept by leaf, in the time

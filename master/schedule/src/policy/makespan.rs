@@ -1,4 +1,4 @@
-//! Which tiles of a sole frame are split, and which worker draws each tile, so that all workers end
+//! Makespan of a sole frame: splits long tiles and assigns tiles to workers so that all workers end
 //! at once.
 //!
 //! While several frames overlap, a worker that is done with one goes on with the next. A sole frame

@@ -1,12 +1,11 @@
-//! Where a frame is cut into slabs: by equal thickness as in the paper, or where the data ask for
+//! Borders of the slabs of a frame: at equal thickness as in the paper, or where the data ask for
 //! it (the paper's future work, its sections 5.3 and 6).
 //!
-//! What a slab is for is that those in front hide bricks of those behind: a brick is needed unless
-//! every pixel under it is shut where its slab begins. Which pixels will be is guessed from the
-//! bricks alone: a leaf of the picture is opaque a little behind the first brick in it. With that
-//! guess, the borders under which the fewest voxels are needed are found exactly, by dynamic
-//! programming over borders a brick apart. Borders are sheet borders, so no pixel changes, and a
-//! wrong guess costs bricks and nothing else.
+//! Slabs in front hide bricks of those behind: a brick is needed unless every pixel under it is
+//! shut where its slab begins. Shut pixels are guessed from the bricks alone: a leaf of the picture
+//! is opaque a little behind the first brick in it. With that guess, the borders under which the
+//! fewest voxels are needed are found exactly, by dynamic programming over borders a brick apart.
+//! Borders are sheet borders, so no pixel changes, and a wrong guess costs bricks and nothing else.
 
 use crate::policy::macrotile::LEAF;
 use slabcast_common::occlusion::Rect;

@@ -1,5 +1,5 @@
-//! Where a frame of the `region` schedule is cut: the tile size for which the cost model predicts
-//! the earliest end, and the tiles that are split.
+//! Size of the tiles of a frame (`region` schedule): the one for which the cost model predicts the
+//! earliest end, and the tiles that are split.
 //!
 //! Rendering takes no longer in tiles of 64 pixels than in larger ones, and a quarter longer in
 //! smaller ones (`cost_history::SPLIT_TIME_RATIO`). Each tile costs its thread and the master a

@@ -1,4 +1,4 @@
-//! Where the render threads' time goes while frames are delivered steadily.
+//! Use of the render threads' time while frames are delivered steadily.
 
 use super::VirtualCluster;
 use super::worker::Idle;

@@ -1,5 +1,5 @@
-//! What the stories and campaigns do with a virtual cluster: they add workers and frames, let time
-//! pass, and compare pictures with those of one thread.
+//! A virtual cluster for the stories and campaigns: they add workers and frames, let time pass, and
+//! compare pictures with those of one thread.
 
 use crate::pattern::{self, Patterns};
 use slabcast_common::ids::{FrameId, WorkerId};

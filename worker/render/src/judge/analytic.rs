@@ -211,9 +211,10 @@ impl LayerStack {
     /// with one colour each, at index position `at`.
     ///
     /// In optical depth t a sheet's light is `int C exp(-t)`; with the mean c of C it is c a. As
-    /// `C - c` has no mean, any constant may be taken from exp(-t): with half of what exp(-t) falls by,
-    /// and `int |C - c| <= tau / 2` times what C spans, the difference is at most `span tau a / 4`.
-    /// What C spans is read at 16 places a sheet; ratios of kernel sums have no finer structure.
+    /// `C - c` has no mean, any constant may be taken from exp(-t): with half of what exp(-t) falls
+    /// by, and `int |C - c| <= tau / 2` times what C spans, the difference is at most `span tau a /
+    /// 4`. What C spans is read at 16 places a sheet; ratios of kernel sums have no finer
+    /// structure.
     pub fn thickness_bound(&self, at: [f64; 2], d: f64) -> f64 {
         let mut bound = 0.0;
         self.sheets(self.lateral(at), d, |seen, k, tau, _| {

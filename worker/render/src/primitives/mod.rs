@@ -1,5 +1,5 @@
-//! Tables and positions that kernels and geometries share: tables of weights, integer positions, lattice rows, fixed
-//! sizes.
+//! Tables and positions that kernels and geometries share: tables of weights, integer positions,
+//! lattice rows, fixed sizes.
 //!
 //! Imports nothing of this crate but itself.
 

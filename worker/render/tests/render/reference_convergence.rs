@@ -1,5 +1,5 @@
-//! Convergence: thin sheets come to the reference, in the order of the colour rule, and the splatter
-//! equals the same sheets in f64.
+//! Convergence: thin sheets come to the reference, in the order of the colour rule, and the
+//! splatter equals the same sheets in f64.
 
 use crate::reference::{BLACK, JudgedScene, alpha, i32_sums, lattices, oblique, projections};
 use slabcast_common::quality::{Compositing, Quality};

@@ -1,4 +1,4 @@
-//! Which worker holds which brick (paper section 4.4), and which bricks it is sent next.
+//! Residency of bricks: which worker holds which (paper section 4.4), and which it is sent next.
 //!
 //! The paper broadcasts a slab's unoccluded bricks and lets every node cache all it ever got. So
 //! does this room, while memory lasts. It adds what happens when memory does not last:

@@ -1,4 +1,4 @@
-//! Which pixels of a picture are judged.
+//! Choice of the pixels of a picture that are judged.
 
 use slabcast_common::occlusion::Rect;
 

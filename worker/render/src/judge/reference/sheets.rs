@@ -1,8 +1,8 @@
 //! Sheets in f64: what a view's thickness alone does to a pixel.
 //!
-//! The same rays, voxels and kernel as the limit's, but cut into sheets and closed by the rule,
-//! with nothing shut. Two things can be switched: how a section is placed, and whether positions
-//! are rounded as the splatter rounds them. So the error of thickness, of placement and of rounded
+//! Rays, voxels and kernel are those of the limit, but cut into sheets and closed by the rule, with
+//! nothing shut. Two things can be switched: how a section is placed, and whether positions are
+//! rounded as the splatter rounds them. So the error of thickness, of placement and of rounded
 //! positions can each be seen without the others.
 
 use super::Reference;
@@ -66,8 +66,8 @@ pub struct ReferenceSheet {
 const PIECE: f64 = 0.5;
 
 /// The rule's 2 %, squared: below that share of a sheet, the sheet before hardly counts
-/// (docs/design/numerics.md section 1.2). Written out again, since the reference shares no code with
-/// the kernels.
+/// (docs/design/numerics.md section 1.2). Written out again, since the reference shares no code
+/// with the kernels.
 const FAINT_BEFORE: f64 = 4e-4;
 
 /// The rule's share of a sheet beside the one behind, which fades thin neighbours

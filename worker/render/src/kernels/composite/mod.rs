@@ -76,8 +76,9 @@ impl Sum for f32 {
     }
 }
 
-/// Weight of the squared sheet against the squared sheet before it in the neighbour-linear rule: the
-/// sheet before counts unless it is below 2 % of this one (docs/design/numerics.md section 1.2).
+/// Weight of the squared sheet against the squared sheet before it in the neighbour-linear rule:
+/// the sheet before counts unless it is below 2 % of this one (docs/design/numerics.md section
+/// 1.2).
 pub(crate) const FAINT_BEFORE: f32 = 4e-4;
 
 /// Weight of the sheet beside the one behind it in the neighbour-linear rule: thin, noisy sheets

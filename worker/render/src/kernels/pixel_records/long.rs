@@ -1,8 +1,8 @@
 //! Records of 32-bit sums in lanes.
 //!
-//! What is added is `(section * wy) * wx + 1/2`, cut off, as the plain loop has it, but without its
-//! clamps: a payload times weights stays below 2^31 (`bounds::i32_units_per_payload`), and what
-//! would not turns into i32's smallest number here and its largest there.
+//! A voxel adds `(section * wy) * wx + 1/2`, cut off, as in the plain loop, but without its clamps:
+//! a payload times weights stays below 2^31 (`bounds::i32_units_per_payload`), and what would not
+//! turns into i32's smallest number here and its largest there.
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx2 {

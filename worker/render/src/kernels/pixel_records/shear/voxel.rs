@@ -1,5 +1,5 @@
-//! What is looked up of a voxel when it is added: where in the tables the weights of its sections
-//! begin.
+//! Look-ups for one sheared voxel as it is added: the indices in the tables at which the weights of
+//! its sections begin.
 
 use super::{COLUMNS, ROWS, Slant};
 use crate::kernels::pixel_records::sheet_offsets::lines::inside;

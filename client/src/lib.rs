@@ -160,7 +160,7 @@ impl Client {
         FrameStream::open(self.clone(), job.to_owned(), from_frame, Some(patience)).await
     }
 
-    /// Returns one job.
+    /// Returns the job with this id as it is now.
     ///
     /// # Errors
     /// [`ClientError::NotFound`] if the master does not know it, [`ClientError::Lost`] if the

@@ -20,7 +20,7 @@ pub struct Blocks {
 pub struct Block {
     /// Box around the bricks' tight boxes, in index coordinates.
     pub tight: TightBox,
-    /// Relevant voxels of all its bricks.
+    /// Number of relevant voxels in all bricks of the block.
     pub voxels: u64,
     /// Its bricks, as a range of [`Blocks::places`].
     range: Range<usize>,

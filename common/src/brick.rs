@@ -12,7 +12,7 @@ use crate::volume::{Digest32, SampleKind, Samples};
 pub const BRICK_EDGE: u32 = 8;
 /// Number of voxels of a full brick: [`BRICK_EDGE`] cubed.
 pub const BRICK_VOXELS: usize = 512;
-/// Most bricks that a volume may have: a 4096^3 volume has 2^27.
+/// Largest number of bricks that a volume may have: a 4096^3 volume has 2^27.
 pub const MAX_BRICKS: u64 = 1 << 27;
 
 /// How a volume is cut into bricks.
@@ -86,7 +86,7 @@ pub struct BrickInfo {
     pub tight: TightBox,
     /// Number of relevant voxels, 1 to 512.
     pub voxels: u16,
-    /// Bytes of its encoding on the wire.
+    /// Bytes of the brick as it is encoded on the wire.
     pub bytes: u32,
 }
 
@@ -98,7 +98,7 @@ pub struct BrickSetKey(pub Digest32);
 /// One brick: its relevant voxels in ascending local index.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Brick {
-    /// The brick's place in its grid.
+    /// Place of the brick in the volume's grid.
     pub id: BrickId,
     /// Local index `x + 8 y + 64 z` of each voxel, ascending.
     pub index: Vec<u16>,
@@ -204,7 +204,7 @@ impl Brick {
         TightBox { lo: at(0), hi: at(1) }
     }
 
-    /// Returns the bytes that the brick takes in memory, its own overhead included.
+    /// Returns the bytes that the brick takes in memory, the overhead of its buffers included.
     pub fn memory_bytes(&self) -> usize {
         let n = self.len();
         std::mem::size_of::<Brick>()

@@ -105,10 +105,10 @@ pub struct RegionSplit {
     pub task: TaskId,
     /// Number of the attempt at the task whose lease was split.
     pub epoch: Epoch,
-    /// Piece of the tile that the worker keeps, in pixels of the picture. Its result has exactly
-    /// these pixels.
+    /// Piece of the tile that the worker keeps, in pixels of the picture. The worker's result has
+    /// exactly these pixels.
     pub kept: Rect,
-    /// Piece that the worker gives away: the rest of the tile.
+    /// Piece of the tile that the worker gives away, in pixels of the picture: all but `kept`.
     pub given: Rect,
     /// State of the given piece at the sheet border where it was split: a worker goes on from here.
     pub begun: Checkpoint,
@@ -221,7 +221,7 @@ pub struct Hello {
     pub protocol_versions: ProtocolVersions,
     /// [`PIXELS_VERSION`](crate::PIXELS_VERSION) of the worker's program.
     pub pixels_version: u32,
-    /// Name for people (host and process).
+    /// Name of the worker for people: host and process.
     pub name: String,
     /// Number of the worker's render threads.
     pub threads: u32,
@@ -243,11 +243,11 @@ pub struct Hello {
 /// definitions).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Voxels put into a sheet's bucket.
+    /// Number of voxels put into a sheet's bucket.
     pub tossed: u64,
     /// Number of voxels drawn into sheets.
     pub splatted: u64,
-    /// Voxels dropped as hidden, with their brick or alone.
+    /// Number of voxels dropped as hidden, with their brick or alone.
     pub culled: u64,
 }
 
@@ -295,13 +295,13 @@ pub struct RegionCost {
 /// Errors of sampled pixels by source.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ErrorsBySource {
-    /// Change under sheets of half the thickness.
+    /// Change of the pixels under sheets of half the thickness.
     pub thickness: SampledError,
-    /// Change under exact instead of rounded positions.
+    /// Change of the pixels under positions that are exact and not rounded.
     pub positions: SampledError,
     /// Change of the pixels under a kernel whose tails are not cut off.
     pub truncation: SampledError,
-    /// Change under a kernel without ripple.
+    /// Change of the pixels under a kernel without ripple.
     pub ripple: SampledError,
 }
 
@@ -331,7 +331,7 @@ impl ErrorsBySource {
 /// matter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SampledError {
-    /// Sampled pixels that are not blank in both pictures.
+    /// Number of sampled pixels that are not blank in both pictures.
     pub pixels: u32,
     /// Sum of squared differences over all four channels (linear premultiplied RGBA), in units of
     /// 2^-48.

@@ -19,12 +19,12 @@ pub const MAX_THREADS: u32 = 4096;
 pub struct ProtocolVersions {
     /// Oldest protocol version that is spoken.
     pub oldest: u32,
-    /// The newest version; not below the oldest.
+    /// Newest protocol version that is spoken; not below the oldest.
     pub newest: u32,
 }
 
 impl ProtocolVersions {
-    /// Returns whether `version` is one of these.
+    /// Returns whether `version` is spoken.
     pub fn contains(self, version: u32) -> bool {
         (self.oldest..=self.newest).contains(&version)
     }

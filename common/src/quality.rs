@@ -30,7 +30,7 @@ pub enum Compositing {
     Paper,
 }
 
-/// How a voxel's section reaches its sheet.
+/// Way in which a voxel's section reaches its sheet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Splat {

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 pub struct SheetRange {
     /// Number of the first sheet in the run.
     pub first: i32,
-    /// Number one past the last sheet.
+    /// Number of the sheet just behind the run.
     pub end: i32,
 }
 

@@ -107,7 +107,7 @@ pub struct TileStats {
     pub est: u64,
     /// Milliseconds that the macrotile took to render.
     pub ms: f64,
-    /// Name of the worker that rendered it.
+    /// Name of the worker that rendered the macrotile.
     pub worker: String,
 }
 
@@ -129,9 +129,9 @@ pub struct SlabStats {
 pub struct LeftOut {
     /// Name of the data that were left out, for example `normals`.
     pub name: String,
-    /// Time saved in milliseconds; `null` where it was not measured.
+    /// Milliseconds that were saved; `null` where nobody measured them.
     pub saved_ms: Option<f64>,
-    /// Bytes saved; `null` where they were not counted.
+    /// Bytes that were saved; `null` where nobody counted them.
     pub saved_bytes: Option<u64>,
 }
 
@@ -167,12 +167,13 @@ pub const THICKNESS_EXTRAPOLATION: f64 = 8.0 / 7.0;
 /// Errors of a frame by source.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ErrorStats {
-    /// Pixels shut before they are opaque: at most eps times the brightest colour.
+    /// Error of pixels that are shut before they are opaque: at most eps times the brightest
+    /// colour.
     pub cutoff: Bound,
     /// Rounding of contributions to the integers of the sums. Slivers of kernels that fall into
     /// another sheet are not counted.
     pub quantisation: Bound,
-    /// Rounding of positions and of f32 arithmetic.
+    /// Error of rounded positions and of f32 arithmetic.
     pub rounding: BoundAndEstimate,
     /// The part of f32 rounding that grows with the number of sheets: opacity stands still where a
     /// sheet adds less than half its last bit.
@@ -217,7 +218,7 @@ pub struct FrameStats {
     /// Slabs, front to back. A frame of the `region` schedule has one, through all sheets; its
     /// tiles are the regions.
     pub slabs: Vec<SlabStats>,
-    /// Quality, with the sums that were used.
+    /// Quality of the picture, with the number type of sums that was used.
     pub quality: Quality,
     /// Data that the scene did not need, so that nobody computed or sent them.
     pub left_out: Vec<LeftOut>,
@@ -254,7 +255,7 @@ pub struct PoisonedTile {
     pub y: u32,
     /// Edge of the macrotile in pixels, before the picture clips it.
     pub size: u32,
-    /// Names of the workers that were lost with it.
+    /// Names of the workers that were lost with the macrotile.
     pub workers: Vec<String>,
 }
 

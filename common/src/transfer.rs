@@ -584,7 +584,7 @@ impl Support {
                 .all(|o| self.intervals.iter().any(|s| s.0 <= o.0 && o.1 <= s.1))
     }
 
-    /// Returns the codes that are relevant in either.
+    /// Returns the codes that are relevant in either support.
     #[must_use]
     pub fn union(&self, other: &Support) -> Support {
         let mut all: Vec<(f64, f64)> =

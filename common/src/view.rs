@@ -113,9 +113,10 @@ pub struct View {
 /// Projection of a box: pixels and sheets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Projected {
-    /// Pixels that any of its footprints may touch, clipped to the picture; not empty.
+    /// Pixels that any footprint of a voxel in the box may touch, clipped to the picture; not
+    /// empty.
     pub rect: Rect,
-    /// Sheets that any of its voxels may touch.
+    /// Sheets that any voxel in the box may touch.
     pub sheets: SheetRange,
 }
 

@@ -10,9 +10,9 @@ use sha2::{Digest, Sha256};
 pub struct Lattice {
     /// Samples along the index axes i, j, k (i fastest).
     pub dims: [u32; 3],
-    /// World vector of one step along each index axis.
+    /// World vectors of one step along each index axis, in world units.
     pub steps: [DVec3; 3],
-    /// World position of sample (0, 0, 0).
+    /// World position of sample (0, 0, 0), in world units.
     pub origin: DVec3,
 }
 
@@ -394,7 +394,7 @@ impl ValueSummary {
 pub struct Volume {
     /// Name for people (the file's, without folders).
     pub name: String,
-    /// Type in the file, for people (`int16`).
+    /// Number type of the samples in the file, for people (`int16`).
     pub file_type: String,
     /// Whether the file says where the patient's right, anterior and superior are.
     pub anatomical: bool,

@@ -85,16 +85,16 @@ pub struct Job {
     pub size: [u32; 2],
     /// Pixel format of the job's frames.
     pub format: PixelFormat,
-    /// When it was submitted, in milliseconds since 1970 UTC.
+    /// Time at which the job was submitted, in milliseconds since 1970 UTC.
     pub submitted_unix_ms: i64,
-    /// When it reached a final state, in milliseconds since 1970 UTC; 0 before.
+    /// Time at which the job reached a final state, in milliseconds since 1970 UTC; 0 before.
     pub finished_unix_ms: i64,
 }
 
 /// The volume that a master serves.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VolumeDescription {
-    /// Name of the volume: that of its file, without folders.
+    /// Name of the volume's file, without folders.
     pub name: String,
     /// The sample type in the file, for people.
     pub file_type: String,
@@ -119,15 +119,15 @@ pub struct Worker {
     pub id: WorkerId,
     /// Name for people (host and process), which statistics use.
     pub name: String,
-    /// Address that it called from; empty for a worker within the master's process.
+    /// Address that the worker called from; empty for a worker within the master's process.
     pub address: String,
     /// Number of the worker's render threads.
     pub threads: u32,
     /// Instruction set that the worker's renderer uses.
     pub simd: String,
-    /// Bytes of bricks that it may hold.
+    /// Bytes of bricks that the worker may hold.
     pub memory_budget_bytes: u64,
-    /// Bytes of bricks that it holds.
+    /// Bytes of bricks that the worker holds.
     pub held_bytes: u64,
     /// Number of bricks that the worker holds.
     pub held_bricks: u64,
@@ -135,18 +135,19 @@ pub struct Worker {
     pub tasks_lent: u32,
     /// Number of tasks that the worker has finished since it joined.
     pub tasks_done: u64,
-    /// Time since the master last heard from it.
+    /// Time since the master last heard from the worker.
     pub silent: Duration,
     /// Time since the worker joined.
     pub connected: Duration,
-    /// Whether it is lent nothing for now, since frames would not be finished sooner with it.
+    /// Whether the worker is lent nothing for now, since frames would not be finished sooner with
+    /// it.
     pub in_reserve: bool,
 }
 
 /// A piece of a finished frame on its way to a client.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameChunk {
-    /// Number of the frame in its job.
+    /// Number of the frame in its job, from 0.
     pub frame: u64,
     /// Width and height in pixels, 1 to 8192 each.
     pub size: [u32; 2],

@@ -142,7 +142,7 @@ impl PathScenes {
         view.map_err(|e| self.request.blame(&e))
     }
 
-    /// Returns whether frames have transfer functions of their own.
+    /// Returns whether each frame has a transfer function of its own, between those of the keys.
     pub fn is_tween(&self) -> bool {
         self.tween.is_some()
     }

@@ -115,7 +115,7 @@ impl Transfer {
         Transfer { light: None, shading: Some(false), ..self.clone() }
     }
 
-    /// Returns the preset that it is or came from.
+    /// Returns the preset that the function is or came from; `None` if there is none.
     pub fn preset(&self) -> Option<&str> {
         match &self.base {
             TransferChoice::Name(name) => Some(name),
@@ -123,12 +123,13 @@ impl Transfer {
         }
     }
 
-    /// Returns the file that it was read from.
+    /// Returns the file that the function was read from; `None` if there is none.
     pub fn file(&self) -> Option<&Path> {
         self.file.as_deref()
     }
 
-    /// Returns its name for ParaView: its own there, else that of the preset or file.
+    /// Returns the name of the function for ParaView: the file's own title, or else that of the
+    /// preset or file.
     pub fn title(&self) -> String {
         let own = || {
             let name = self.name();

@@ -104,7 +104,7 @@ impl Tween {
         SceneSpec { transfer, quality: Quality { sums, ..base.quality }, ..base.clone() }
     }
 
-    /// Returns functions whose supports together hold that of every frame.
+    /// Returns functions whose supports together hold the support of every frame.
     pub fn key_functions(&self) -> impl Iterator<Item = &TransferFunction> {
         // Moving a point from shares to file values rounds it: both count.
         self.keys.iter().flat_map(|(_, exact, plain)| [exact, plain])

@@ -35,7 +35,8 @@ pub struct FrameState {
 }
 
 impl FrameState {
-    /// Most bytes that a pixel takes: opacity, three colours, and two sheets' sums.
+    /// Largest number of bytes that a pixel takes: opacity, three colours, and the sums of two
+    /// sheets.
     pub const BYTES_A_PIXEL: u64 = 4 + 12 + 2 * 16;
 
     /// Returns an empty frame of `size` (width, height) pixels.

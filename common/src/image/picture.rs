@@ -31,10 +31,10 @@ impl Picture {
     }
 }
 
-/// A picture as it leaves the master.
+/// An encoded picture with its hash, as it leaves the master.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Encoded {
-    /// Hash as [`Picture::sha256`] gives it; `None` if the job did not ask.
+    /// Hash of the linear picture as [`Picture::sha256`] gives it; `None` if the job did not ask.
     pub sha256: Option<Digest32>,
     /// Bytes of the picture as [`Picture::encode`] gives them.
     pub bytes: Vec<u8>,

@@ -17,7 +17,7 @@ pub type RawSums = [u32; 4];
 /// Pixels that a slab task starts from, as the slabs in front left them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TileState {
-    /// Accumulated opacity A, row-major in the tile.
+    /// Accumulated opacity A of each pixel, 0 to 1, row-major in the tile.
     pub a: Vec<f32>,
     /// Raw sums of the last sheet in front of the slab; `None` if all are zero.
     pub last: Option<Vec<RawSums>>,

@@ -37,7 +37,7 @@ pub const VERSION: u32 = 6;
 /// Largest trace that is read, in bytes: 1000 frames with tiles of 16 pixels.
 pub const MAX_BYTES: u64 = 1 << 30;
 
-/// A recorded path: one [`FrameTrace`] a frame, and what they were recorded from.
+/// A recorded path: one [`FrameTrace`] a frame, and the scene, machine and program behind them.
 ///
 /// Read one with [`Trace::from_json`], write it with [`Trace::to_json`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -81,9 +81,9 @@ pub struct About {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Packing {
-    /// Nanoseconds a worker takes to pack a byte.
+    /// Nanoseconds that a worker takes to pack a byte.
     pub pack_ns: f64,
-    /// Nanoseconds the master takes to unpack it.
+    /// Nanoseconds that the master takes to unpack a byte.
     pub unpack_ns: f64,
 }
 
@@ -94,9 +94,11 @@ pub struct Packing {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Pings {
-    /// One worker is pinged: every thread on the way has to be woken.
+    /// Nanoseconds of a ping while one worker is pinged, so that every thread on the way has to be
+    /// woken: the master's driver, the master's streams, the worker.
     pub alone_ns: [u64; 3],
-    /// Many workers are pinged at once: hardly any thread has to be woken.
+    /// Nanoseconds of a ping while many workers are pinged at once, so that hardly any thread has
+    /// to be woken: the master's driver, the master's streams, the worker.
     pub company_ns: [u64; 3],
 }
 
@@ -108,10 +110,10 @@ pub struct FrameTrace {
     pub view: String,
     /// Nanoseconds of the tables that each worker makes once a frame.
     pub setup_ns: u64,
-    /// Nanoseconds of the whole frame on one core in its best cut, tables included: what more
-    /// workers are compared with.
+    /// Nanoseconds of the whole frame on one core in its best cut, tables included: the basis for
+    /// the speed-up of more workers.
     pub alone_ns: u64,
-    /// Edge of the tiles of that cut, in pixels.
+    /// Edge in pixels of the tiles in the cut of `alone_ns`.
     pub alone_edge: u32,
     /// Slabs, front to back: for the `slab` schedule.
     pub slabs: Vec<SlabTrace>,
@@ -159,7 +161,7 @@ pub struct Level {
 pub struct RegionLevel {
     /// Edge of the tiles in pixels, before the picture clips them.
     pub edge: u32,
-    /// Tiles with something in them, by row and column.
+    /// Tiles with something to draw in them, by row and column.
     pub tiles: Vec<RegionTile>,
 }
 
@@ -176,16 +178,16 @@ pub struct RegionTile {
     pub x: u32,
     /// Top row of the tile, in pixels of the picture.
     pub y: u32,
-    /// Nanoseconds to draw it, its blocks of bricks being known.
+    /// Nanoseconds to draw the tile once its blocks of bricks are known.
     pub ns: u64,
-    /// Bytes of its result on the wire: finished pixels, packed.
+    /// Bytes of the tile's result on the wire: finished pixels, packed.
     pub result_bytes: u32,
-    /// Bytes of its result on the wire: finished pixels, not packed.
+    /// Bytes of the tile's result on the wire: finished pixels, not packed.
     pub plain_bytes: u32,
-    /// Places of the bricks that it is drawn from, ascending.
+    /// Places of the bricks that the tile is drawn from, ascending.
     pub touched: Vec<u32>,
-    /// Numbers of the blocks whose bricks it looks at, ascending; blocks are numbered front to
-    /// back.
+    /// Numbers of the blocks whose bricks the tile looks at, ascending; blocks are numbered front
+    /// to back.
     pub opened: Vec<u32>,
     /// When drawing comes to each of `touched`, in thousandths of `ns`. Only tiles of one part have
     /// it; larger tiles take it from their parts. Empty: all bricks are needed at once.
@@ -196,7 +198,7 @@ pub struct RegionTile {
 }
 
 impl RegionTile {
-    /// Bytes of its result on the wire, `plain` or packed.
+    /// Returns the bytes of the tile's result on the wire, `plain` or packed.
     pub fn wire_bytes(&self, plain: bool) -> u32 {
         if plain { self.plain_bytes } else { self.result_bytes }
     }

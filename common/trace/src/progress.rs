@@ -230,7 +230,7 @@ impl RegionProgress {
         self.parts.iter().map(|p| p.total_ns).sum()
     }
 
-    /// Returns the nanoseconds that are left of it.
+    /// Returns the nanoseconds of drawing that are left of the tile.
     pub fn left_ns(&self) -> f64 {
         self.parts.iter().map(Part::left_ns).sum()
     }

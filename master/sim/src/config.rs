@@ -4,7 +4,7 @@ use crate::Nanos;
 use slabcast_common::link::FRAMES_IN_FLIGHT;
 use slabcast_schedule::{Config, Micros};
 
-/// One link between two machines, each way.
+/// Link between two machines: its rate and latency, the same each way.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Link {
     /// Bytes a second that a stream gets through; `None`: no limit.
@@ -21,9 +21,9 @@ impl Link {
 /// Processor time that grows with a count of bytes or pixels, in nanoseconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct LinearCost {
-    /// Nanoseconds of the operation as such.
+    /// Nanoseconds of one operation, whatever its size.
     pub fixed_ns: f64,
-    /// Nanoseconds for each byte or pixel.
+    /// Nanoseconds that each byte or pixel adds to an operation.
     pub per_unit_ns: f64,
 }
 
@@ -45,56 +45,60 @@ pub struct MessageCosts {
     pub wake_ns: f64,
     /// Nanoseconds of a read from or a write to a socket.
     pub call_ns: f64,
-    /// Sending a message of so many bytes.
+    /// Time to send a message, by its bytes.
     pub send: LinearCost,
-    /// Receiving a message of so many bytes.
+    /// Time to receive a message, by its bytes.
     pub receive: LinearCost,
-    /// Sending or receiving a batch of bricks of so many bytes.
+    /// Time to send or receive a batch of bricks, by its bytes.
     pub bricks: LinearCost,
 }
 
 /// Processor time of messages and decisions, in nanoseconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Costs {
-    /// Driver: begins the first frame, which also sorts the bricks; a brick of the frame.
+    /// Nanoseconds of the master's driver to begin the first frame, for each brick of it; the
+    /// bricks are also sorted then.
     pub first_brick_ns: f64,
-    /// Driver: begins a later frame; a brick of the frame.
+    /// Nanoseconds of the master's driver to begin a later frame, for each brick of it.
     pub frame_brick_ns: f64,
-    /// Driver: begins a slab; a brick of the frame.
+    /// Nanoseconds of the master's driver to begin a slab, for each brick of its frame.
     pub slab_brick_ns: f64,
-    /// Driver: begins a slab; a pixel of the picture.
+    /// Nanoseconds of the master's driver to begin a slab, for each pixel of the picture.
     pub slab_pixel_ns: f64,
-    /// Driver: gives a lease of so many pixels.
+    /// Time of the master's driver to give a lease, by its pixels.
     pub lease: LinearCost,
-    /// Driver: takes a result of so many pixels.
+    /// Time of the master's driver to take a result, by its pixels.
     pub result: LinearCost,
-    /// Driver: looks for the bricks of a frame to prefetch.
+    /// Nanoseconds of the master's driver to look for bricks of a frame to prefetch.
     pub prefetch_ns: f64,
-    /// Driver: handles any other event, in nanoseconds.
+    /// Nanoseconds of the master's driver to handle any other event.
     pub event_ns: f64,
-    /// Driver: begins to work after it slept.
+    /// Nanoseconds until the master's driver begins to work after it slept.
     pub driver_wake_ns: f64,
-    /// Driver: takes a message from its queue, or puts one into a link's.
+    /// Nanoseconds of the master's driver to take a message from its queue, or to put one into a
+    /// link's.
     pub driver_message_ns: f64,
-    /// Master's streams: sends a pixel of a picture to the client.
+    /// Nanoseconds of the master's streams to send a pixel of a picture to the client.
     pub deliver_pixel_ns: f64,
-    /// Client, where it runs on the master's machine: receives a pixel.
+    /// Nanoseconds of a client on the master's machine to receive a pixel.
     pub client_pixel_ns: f64,
-    /// Master's streams: costs of reading and writing messages.
+    /// Costs of messages for the master's streams.
     pub master: MessageCosts,
-    /// Master's finishers: hash and encode a pixel.
+    /// Nanoseconds of the master's finishers to hash and encode a pixel.
     pub finish_pixel_ns: f64,
-    /// Master's finishers in a rehearsal, whose pictures are marked all over: a pixel.
+    /// Nanoseconds of the master's finishers in a rehearsal, which marks pictures all over, for
+    /// each pixel.
     pub mark_pixel_ns: f64,
-    /// A worker's stream: messages. Waking one of its render threads costs as much.
+    /// Costs of messages for a worker's stream; to wake one of its render threads costs as much as
+    /// to wake the stream.
     pub worker: MessageCosts,
-    /// Worker: packs a byte of finished pixels.
+    /// Nanoseconds of a worker to pack a byte of finished pixels.
     pub pack_byte_ns: f64,
-    /// Master's streams: unpack a byte of finished pixels.
+    /// Nanoseconds of the master's streams to unpack a byte of finished pixels.
     pub unpack_byte_ns: f64,
-    /// Rehearsing worker: fills the planes of a result of so many pixels.
+    /// Time of a rehearsing worker to fill the planes of a result, by its pixels.
     pub placeholder: LinearCost,
-    /// Rehearsing worker: the system wakes a thread that holds a tile so much too late.
+    /// Nanoseconds by which the system wakes a rehearsing worker's thread too late.
     pub late_wake_ns: f64,
 }
 
@@ -165,18 +169,19 @@ pub struct WorkerProfile {
     pub time_jitter: f64,
     /// Nanoseconds that each run of a task takes besides drawing.
     pub run_overhead_ns: Nanos,
-    /// Bytes of bricks that it may hold.
+    /// Bytes of bricks that the worker may hold.
     pub memory_budget_bytes: u64,
-    /// Bytes a second of its link each way; `None`: no limit.
+    /// Bytes a second that the worker's link carries each way; `None`: no limit.
     pub bytes_per_s: Option<f64>,
     /// Least and largest latency of a message, in nanoseconds. Messages of a stream keep their
     /// order.
     pub latency_ns: [Nanos; 2],
-    /// Bytes a second at which its bricks arrive, besides the link; `None`: no limit.
+    /// Bytes a second at which bricks reach the worker, beside the link's own limit; `None`: no
+    /// limit.
     pub brick_bytes_per_s: Option<f64>,
-    /// Microseconds by which its clock is ahead of the master's.
+    /// Microseconds by which the worker's clock is ahead of the master's.
     pub clock_ahead_us: Micros,
-    /// Faults that it has of itself.
+    /// Faults that the worker has by itself.
     pub faults: Faults,
 }
 

@@ -13,11 +13,11 @@ use slabcast_trace::HasBrick;
 pub struct TaskFacts {
     /// Nanoseconds to draw a slab's tile at unit speed. Regions have their progress instead.
     pub ns: f64,
-    /// Bytes of its lease on the wire.
+    /// Bytes of the task's lease on the wire.
     pub lease_bytes: u64,
-    /// Bytes of its result on the wire if finished pixels are packed. Sums weigh as much.
+    /// Bytes of the task's result on the wire if finished pixels are packed. Sums weigh as much.
     pub packed_bytes: u64,
-    /// Bytes of its result on the wire if finished pixels are not packed.
+    /// Bytes of the task's result on the wire if finished pixels are not packed.
     pub plain_bytes: u64,
     /// Region: numbers of the brick blocks that a worker looks at, once a frame each.
     pub blocks: Vec<u32>,
@@ -45,14 +45,15 @@ pub struct TaskOutput {
     pub pixels: Pixels,
     /// Voxels that were tossed, splatted and culled.
     pub counters: Counters,
-    /// Region: places of the bricks that it was drawn from, ascending.
+    /// Places in the brick list of the bricks that a region was drawn from, ascending; empty for a
+    /// slab's tile.
     pub touched: Vec<u32>,
 }
 
 /// A region cut in two: the worker keeps one piece and hands the other over.
 #[derive(Clone, Debug)]
 pub struct Split {
-    /// Pixels of the piece that stays.
+    /// Pixels of the piece that its worker keeps.
     pub kept: Rect,
     /// Pixels of the piece that is handed over.
     pub given: Rect,

@@ -32,7 +32,7 @@ pub struct FrameOutcome {
     pub handed_over: u64,
     /// Number of messages from the master, bricks not included.
     pub messages_down: u64,
-    /// Number of writes that carried these messages; some leave together.
+    /// Number of writes that carried the master's messages; some messages leave together.
     pub writes_down: u64,
     /// Number of messages to the master.
     pub messages_up: u64,
@@ -291,7 +291,7 @@ impl Tally {
         self.ns += ns;
     }
 
-    /// Returns the nanoseconds of one, 0 if there was none.
+    /// Returns the mean nanoseconds of an operation, 0 if there was none.
     pub fn each_ns(self) -> f64 {
         if self.count == 0 { 0.0 } else { self.ns as f64 / self.count as f64 }
     }
@@ -300,15 +300,15 @@ impl Tally {
 /// Processor time of the scheduler's decisions by kind, as [`Observer::processor_ns`] measured it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DecisionTimes {
-    /// Beginning the first frame, by its bricks.
+    /// Time to begin the first frame, counted by its bricks.
     pub first_frame: Tally,
-    /// Beginning later frames, by their bricks.
+    /// Time to begin later frames, counted by their bricks.
     pub frames: Tally,
-    /// Beginning slabs, by the bricks of their frames.
+    /// Time to begin slabs, counted by the bricks of their frames.
     pub slabs: Tally,
-    /// Pixels of the pictures whose slabs were begun.
+    /// Number of pixels of the pictures whose slabs were begun.
     pub slab_pixels: u64,
-    /// Taking results that began no frame or slab; counts their pixels.
+    /// Time to take results that began no frame or slab, counted by their pixels.
     pub results: Tally,
     /// Number of results that began no frame or slab.
     pub result_count: u64,
@@ -316,8 +316,8 @@ pub struct DecisionTimes {
     pub lease_count: u64,
     /// Number of pixels of the leases that `lease_count` counts.
     pub lease_pixels: u64,
-    /// Looking for bricks to prefetch; counts the looks.
+    /// Time to look for bricks to prefetch, counted by the looks.
     pub prefetches: Tally,
-    /// Handling all other events; counts the events.
+    /// Time to handle all other events, counted by the events.
     pub others: Tally,
 }

@@ -78,7 +78,7 @@ pub struct JobView {
     pub format: PixelFormat,
     /// Time of submission, in milliseconds since 1970 UTC.
     pub submitted_unix_ms: i64,
-    /// Time of its end, in milliseconds since 1970 UTC; 0 before.
+    /// Time at which the job ended, in milliseconds since 1970 UTC; 0 before.
     pub finished_unix_ms: i64,
 }
 
@@ -95,7 +95,7 @@ pub struct FinishedFrame {
     pub bytes: Bytes,
     /// Statistics of the frame, with its hashes.
     pub stats: FrameStats,
-    /// `stats` as one line of JSON.
+    /// Statistics of the frame as one line of JSON.
     pub stats_json: String,
     /// Spans as a JSON array of Chrome trace events, if the client asked for them.
     pub trace_json: Option<String>,

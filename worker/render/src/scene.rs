@@ -24,11 +24,11 @@ use std::sync::Arc;
 /// views share it.
 #[derive(Debug)]
 pub struct Scene {
-    /// Extinction and colour by sample code.
+    /// Table of extinction (per vox) and colour (linear, 0 to 1) by sample code.
     pub classifier: Classifier,
-    /// Lighting; `None` where voxels are unlit.
+    /// Lighting of voxels; `None` where voxels are unlit.
     pub shader: Option<Shader>,
-    /// The quality asked for, with [`Sums::Auto`] resolved.
+    /// Quality of the pictures, with [`Sums::Auto`] resolved.
     pub quality: Quality,
     /// The volume's division into bricks of 8x8x8 voxels.
     pub grid: BrickGrid,
@@ -126,7 +126,7 @@ fn local_of([i, j, k]: [u32; 3]) -> u16 {
 /// Position of a brick's first voxel in a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Corner {
-    /// Index position of its first voxel.
+    /// Index position (i, j, k) of the brick's first voxel.
     #[doc(hidden)]
     pub index: [u32; 3],
     /// Eye coordinates of the brick's first voxel, in vox.
@@ -142,7 +142,7 @@ pub struct Corner {
 pub struct Placed {
     /// Eye coordinates of the voxel, in vox.
     pub eye: DVec3,
-    /// Depth in phases of a sheet ([`View::depth_phases`]).
+    /// Depth of the voxel in phases of a sheet ([`View::depth_phases`]).
     pub z: i32,
     /// Screen position in subpixels, in orthographic views.
     screen: Option<[i64; 2]>,

@@ -62,7 +62,7 @@ pub struct Scratch {
     last: Vec<RawSums>,
 }
 
-/// Memory of the fast geometries, for each kind of sums.
+/// Memory of the fast geometries, for each number type of sums.
 #[doc(hidden)]
 #[derive(Default)]
 pub struct Whole {

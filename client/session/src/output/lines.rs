@@ -84,7 +84,7 @@ impl Lines {
         }
     }
 
-    /// Adds text as it is.
+    /// Writes the text as it is to where lines go.
     ///
     /// # Errors
     /// The text can't be written.
@@ -123,7 +123,7 @@ impl Lines {
         !matches!(self, Lines::None)
     }
 
-    /// Gives the file its name.
+    /// Ends the lines and gives a kept file its final name.
     ///
     /// # Errors
     /// The file can't be written.

@@ -39,7 +39,7 @@ pub struct Provenance {
     pub volume_sha256: String,
     /// The view, or the whole path of a moving picture.
     pub path: ViewPath,
-    /// Preset that the transfer function came from.
+    /// Name of the preset that the transfer function came from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub preset: Option<String>,
     /// Transfer function of the picture, a preset already fitted to the volume.

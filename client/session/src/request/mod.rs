@@ -31,7 +31,7 @@ use std::path::PathBuf;
 pub struct RenderRequest {
     /// Views and size, the range of frames applied.
     pub path: ViewPath,
-    /// File that the path was read from.
+    /// File that the path was read from; `None` if flags made the path.
     pub path_file: Option<PathBuf>,
     /// Axes that were given, if a side of the body was asked for.
     side: Option<AxisArgs>,
@@ -50,7 +50,7 @@ pub struct RenderRequest {
     pub background: Background,
     /// Whether statistics carry the hash of the linear picture.
     pub hashed: bool,
-    /// Whether pictures carry that hash, as those of early versions did.
+    /// Whether pictures carry the hash of the linear picture, as those of early versions did.
     pub hash_inside: bool,
 }
 
@@ -68,7 +68,7 @@ impl RenderRequest {
         self.path.size.map(|n| n * self.magnify)
     }
 
-    /// Returns the numbers of its frames on the whole path.
+    /// Returns the numbers of the request's frames on the whole path.
     pub fn frames(&self) -> std::ops::Range<u64> {
         let first = self.path.first_frame() as u64;
         first..first + self.path.frames() as u64

@@ -92,9 +92,11 @@ impl Crop {
 /// A cropping box of one lattice. Ends are relative to the centre of the volume, in world units.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CropBox {
-    /// Lower ends; -inf where nothing is cropped.
+    /// Lower ends along the world's axes, in world units from the volume's centre; -inf where
+    /// nothing is cropped.
     pub lo: DVec3,
-    /// Upper ends; inf where nothing is cropped.
+    /// Upper ends along the world's axes, in world units from the volume's centre; inf where
+    /// nothing is cropped.
     pub hi: DVec3,
 }
 

@@ -28,7 +28,7 @@ pub enum Easing {
     Linear,
 }
 
-/// Side of the body from which it is seen.
+/// Side of the body that the eye looks from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Side {
@@ -125,10 +125,10 @@ pub struct KeyFrames {
     /// Kind of motion between neighbouring keys: smooth or at constant speed.
     #[serde(default)]
     pub easing: Easing,
-    /// Up axis; default that of the volume.
+    /// Axis that points up in pictures; `None` takes the volume's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub up: Option<Axis>,
-    /// Front axis; default that of the volume.
+    /// Axis that faces the eye at azimuth 0; `None` takes the volume's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub front: Option<Axis>,
     /// The keys, ascending in time; 1 to [`MAX_KEYS`].

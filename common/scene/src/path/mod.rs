@@ -174,7 +174,7 @@ pub struct ViewPath {
     /// Explicit cameras, one for each frame; empty where another field makes the path.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub views: Vec<PathView>,
-    /// A turn about the up axis.
+    /// Turn about the up axis; `None` where another field makes the path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub turntable: Option<Turntable>,
     /// Key frames joined by curves; `None` where another field makes the path.
@@ -197,7 +197,7 @@ pub struct ViewPath {
 pub struct Orientation {
     /// World axis that points up in pictures.
     pub up: Axis,
-    /// Front axis (anterior, for anatomical files).
+    /// Axis that points to the front of the volume: anterior, for anatomical files.
     pub front: Axis,
 }
 

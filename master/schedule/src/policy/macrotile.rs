@@ -22,7 +22,7 @@ pub const LEAF: u32 = 16;
 /// slab with it.
 pub const LEVELS: usize = 5;
 
-/// A tile of the level that was chosen.
+/// A macrotile of the quadtree level that was chosen, and its workload (paper section 4.3).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Macrotile {
     /// Rectangle of the tile's pixels, clipped to the picture.

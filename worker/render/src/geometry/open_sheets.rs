@@ -144,7 +144,7 @@ impl<V> Default for Queues<V> {
     }
 }
 
-/// Open sheets of a part, whatever they keep their sums in.
+/// A container of the open sheets of a part, by the way in which it keeps sums.
 pub trait Open<S: Recorded> {
     /// Sums of the sheet before by pixel, and where these are.
     fn before(&mut self) -> (&mut [S::Pixel], &mut Rows);
@@ -156,7 +156,7 @@ pub trait Open<S: Recorded> {
     fn empty(&mut self, k: i32);
 }
 
-/// How voxels of one kind of view get into sheets, which are kept in `H`.
+/// Stage that brings voxels of one kind of view into sheets, which are kept in `H`.
 pub trait Stage<H> {
     /// A voxel waiting in the bucket of its first sheet.
     type Voxel: Copy;

@@ -102,7 +102,8 @@ impl Batch {
     }
 }
 
-/// Draws a part, as work that is compiled once for each instruction set.
+/// Work that draws one part of an orthographic view into pixel records; it is compiled once for
+/// each instruction set.
 pub struct RenderOrtho<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
     pub(crate) view: &'a Flat,

@@ -127,7 +127,8 @@ pub fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
     fits.then_some(Deep { focal, distance, reach: reach.map(|reach| reach as i32) })
 }
 
-/// Draws a part, as work that is compiled once for each instruction set.
+/// Work that draws one part of a perspective view into pixel records; it is compiled once for each
+/// instruction set.
 pub struct RenderPerspective<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
     pub(crate) deep: Deep,
@@ -148,7 +149,8 @@ impl<S: Recorded, const N: usize> Work for RenderPerspective<'_, S, N> {
     }
 }
 
-/// Draws a part of a view with a level camera into row records, as such work.
+/// Work that draws one part of a perspective view with a level camera into row records; it is
+/// compiled once for each instruction set.
 pub struct RenderPerspectiveSharedRows<'a, S: Recorded, const N: usize> {
     pub(crate) deep: RenderPerspective<'a, S, N>,
     pub(crate) lattice_rows: &'a LatticeRows,

@@ -33,14 +33,14 @@ pub struct Profile {
 }
 
 impl Profile {
-    /// A Gaussian of deviation `std` vox, cut at `radius` vox, with its edge value subtracted and
-    /// its integral normalised to one.
+    /// Makes a Gaussian of deviation `std` vox, cut at `radius` vox, with its edge value subtracted
+    /// and its integral normalised to one.
     pub fn new(std: f64, radius: f64) -> Profile {
         let bare = Profile { std, radius, norm: 1.0, degree: None };
         Profile { norm: bare.unnormalised(radius), ..bare }
     }
 
-    /// The kernel of `quality` on a lattice of steps of one vox.
+    /// Makes the kernel of `quality` on a lattice of steps of one vox.
     pub fn from_quality(quality: &Quality) -> Profile {
         let [std, radius] = quality.kernel_shape();
         match quality.kernel {
@@ -131,7 +131,7 @@ pub struct LayerStack {
     pub profile: Profile,
     /// Lattice points of each layer along the picture's two axes.
     pub across: [Range<i32>; 2],
-    /// The layers front to back; their middle lies in the target's plane.
+    /// Layers front to back; their middle lies in the target's plane.
     pub layers: Vec<Layer>,
 }
 

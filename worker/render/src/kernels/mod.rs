@@ -138,7 +138,8 @@ pub trait Accumulate: Sum {
     }
 }
 
-/// One channel of a section of 32-bit sums, not negative and not NaN, or that times weights.
+/// One channel of a section of 32-bit sums, in raw units, or such a channel times weights. Neither
+/// negative nor NaN.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Section(f32);
 
@@ -291,7 +292,8 @@ impl Accumulate for f32 {
     }
 }
 
-/// The product of two numbers in units of 2^-15, rounded to nearest: one instruction on lanes.
+/// Returns the product of two numbers in units of 2^-15, rounded to nearest: one instruction on
+/// lanes.
 #[inline(always)]
 pub fn times(a: i16, b: i16) -> i16 {
     ((i32::from(a) * i32::from(b) + 0x4000) >> 15) as i16

@@ -21,13 +21,13 @@ use std::sync::Arc;
 pub struct PixelExplanation {
     /// Linear premultiplied RGBA, equal to the rendered pixel bit for bit.
     pub pixel: [f32; 4],
-    /// The sheets that hold something at the pixel and were composited, front to back.
+    /// Sheets that hold something at the pixel and were composited, front to back.
     pub sheets: Vec<SheetAtPixel>,
     /// The sheet after which the pixel was shut; `None` if it stayed open.
     pub shut_in: Option<i32>,
     /// Number of voxels with a section in one of the composited sheets.
     pub voxels: usize,
-    /// Number of bricks of these voxels.
+    /// Number of bricks that hold the voxels counted in `voxels`.
     pub bricks: usize,
     /// Number of voxels that cover the pixel but begin behind the sheet in which it was shut.
     pub hidden_voxels: usize,
@@ -42,24 +42,24 @@ pub struct SheetAtPixel {
     pub k: i32,
     /// The sheet's sums in raw units: extinction, then the three colours times extinction.
     pub raw: [f32; 4],
-    /// The sums of the sheet behind when this one was composited, half filled: the colour rule's
+    /// Raw sums of the sheet behind when this one was composited, half filled: the colour rule's
     /// peek.
     pub peek: [f32; 4],
     /// Optical depth of the sheet along the ray (sum of opacities, for the paper's compositing).
     pub tau: f32,
-    /// Mean linear RGB, weighted by extinction.
+    /// Mean linear red, green and blue of the sheet, 0 to 1, weighted by extinction.
     pub colour: [f32; 3],
     /// Accumulated opacity in front of the sheet, 0 to 1.
     pub a_before: f32,
-    /// Accumulated opacity behind the sheet; transmittance is `1 - a`.
+    /// Accumulated opacity behind the sheet, 0 to 1; transmittance is `1 - a`.
     pub a: f32,
     /// Light that the sheet adds to the pixel: linear, premultiplied, one rounding to 2^-28.
     pub light: [f64; 3],
     /// Number of voxel sections that are not zero at the pixel.
     pub sections: usize,
-    /// Number of bricks of these sections.
+    /// Number of bricks that hold the sections counted in `sections`.
     pub bricks: usize,
-    /// The sections with the largest optical depths, largest first.
+    /// Sections with the largest optical depths, largest first.
     pub strongest: Vec<SectionAtPixel>,
 }
 

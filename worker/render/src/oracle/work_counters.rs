@@ -15,13 +15,13 @@ use std::sync::Arc;
 #[derive(Clone, Debug, PartialEq)]
 pub struct WorkCounters {
     width: usize,
-    /// The sheet after which the pixel was shut; `None` where it stayed open.
+    /// Number of the sheet after which each pixel was shut; `None` where it stayed open.
     pub shut_in: Vec<Option<i32>>,
     /// Number of sheets that held something at the pixel, up to the one in which it was shut.
     pub sheets: Vec<u32>,
     /// Number of voxel sections added at the pixel, up to the sheet in which it was shut.
     pub sections: Vec<u32>,
-    /// The first sheet that held something at any pixel.
+    /// Number of the first sheet that held something at any pixel.
     pub first: Option<i32>,
 }
 

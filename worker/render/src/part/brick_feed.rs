@@ -47,7 +47,7 @@ pub(crate) struct TakenBrick {
 /// A list that grows while its items are borrowed. Clearing it keeps its memory.
 pub struct AppendList<T> {
     len: Cell<usize>,
-    /// Chunk n holds `CHUNK << n` items.
+    /// Chunks of items: chunk n holds 64 * 2^n items.
     pub chunks: [OnceCell<Vec<OnceCell<T>>>; 26],
 }
 

@@ -210,7 +210,7 @@ pub struct Slant<'a> {
     /// Slope of x over y of the sheared kernel in units of 2^-16 ([`Lean::row_fixed`]): less than
     /// 2^20 either way.
     pub row: i32,
-    /// Whether sections or rows have columns of their own.
+    /// Whether the rows of a section are offset from each other across the picture.
     pub skewed: bool,
     /// Columns of a row that all sections of a voxel have together, at most: [`SHEAR_COLUMNS`], or
     /// if they all have the same [`LINE`].

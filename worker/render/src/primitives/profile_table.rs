@@ -3,7 +3,7 @@
 /// Nodes of a profile's table.
 const NODES: usize = 2048;
 
-/// A profile by its distance: nodes to its radius, lines between.
+/// Table of a profile by distance from its middle: nodes out to its radius, with lines between.
 #[derive(Debug)]
 pub struct ProfileTable {
     nodes: Vec<f32>,

@@ -14,15 +14,15 @@ pub const MOST: usize = 8;
 /// register.
 pub const LINE: usize = 16;
 
-/// Most pixel rows that all sections of a sheared voxel have together, and least number of zeros
-/// around a phase's weights. A lattice of slices twice as thick as its pixels, seen at two pixels a
-/// voxel from 30 degrees above, has some 20.
+/// Largest number of pixel rows that all sections of a sheared voxel have together, and least
+/// number of zeros around a phase's weights. A lattice of slices twice as thick as its pixels, seen
+/// at two pixels a voxel from 30 degrees above, has some 20.
 pub const SHEAR_ROWS: usize = 32;
 
-/// Most columns of one pixel row that all sections of a sheared voxel have together.
+/// Largest number of columns that all sections of a sheared voxel have together in one pixel row.
 pub const SHEAR_COLUMNS: usize = 24;
 
-/// Most lattice rows that reach a pixel: kernels with a radius of seven lattice steps.
+/// Largest number of lattice rows that reach a pixel: kernels with a radius of seven lattice steps.
 pub const REACHING: usize = 16;
 
 /// Most lattice rows of a part of 64 pixels, with those that reach in from outside. It needs 104;

@@ -95,8 +95,8 @@ impl Profile {
         Profile { radius, form, table, per_step: 1.0 / h }
     }
 
-    /// The whole Gaussian: out to where all that is beyond, times `most`, is below 1e-9. Of splines
-    /// nothing was cut.
+    /// Returns the whole Gaussian, out to where all that is beyond, times `most`, is below 1e-9.
+    /// Splines stay as they are: nothing was cut.
     pub fn untruncated(&self, most: f64) -> Profile {
         let Form::Gaussian(g) = self.form else { return self.clone() };
         let tail = |radius: f64| libm::erfc(radius * g.steep.sqrt()) * most.max(1.0);
@@ -143,7 +143,7 @@ impl Profile {
         }
     }
 
-    /// The integral of `u` times the profile from `u` to `u + d`.
+    /// Returns the integral of `u` times the profile from `u` to `u + d`, in vox.
     pub fn moment(&self, u: f64, d: f64) -> f64 {
         let [from, to] = [u, u + d].map(|u| u.clamp(-self.radius, self.radius));
         match self.form {

@@ -229,7 +229,7 @@ mod lean {
 /// Weights in the sheets that voxels reach, from the sheet of `slot` on.
 #[derive(Clone, Copy)]
 pub struct Layers<'a, S: Recorded, const N: usize> {
-    /// Weights across and down, by slot.
+    /// Tables of the weights across and down the picture, by axis and slot.
     pub across: [[Table<'a, S::Weight>; N]; 2],
     /// Table of the weights in depth, a row for each depth phase.
     pub deep: Table<'a, S::Depth>,
@@ -342,8 +342,9 @@ pub(crate) fn along_row(row: i64, [x, y_of]: [i32; 2], y: i32) -> i32 {
     x + Lean::along_row(row, i64::from(middle - y_of)) as i32
 }
 
-/// `splat_apart` of voxels whose rows lie aside of each other, too: each row has weights of its
-/// own. `phases`: where those across lie in each slot.
+/// Adds voxels as [`Recorded::splat_apart`] does, where rows are offset from each other, too: each
+/// row has weights of its own. `row` is [`Lean::row_fixed`]; `phases` has the layout of the weights
+/// across in each slot.
 #[inline(always)]
 pub fn splat_skewed<S: Recorded, const N: usize>(
     simd: Simd,

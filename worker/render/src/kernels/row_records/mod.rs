@@ -222,7 +222,7 @@ impl<S: Recorded> Folded<S> {
 }
 
 impl<'a, S: Recorded, const N: usize> Tiers<'a, S, N> {
-    /// In memory that is all zero, but for margins of tiers of this shape.
+    /// Takes `lines` as memory for tiers of `shape`; it must be zero but for the tiers' margins.
     ///
     /// # Panics
     /// If there are not as many lines.

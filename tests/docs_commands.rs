@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
 const SLABCAST: &str = env!("CARGO_BIN_EXE_slabcast");
-/// What documents call a master by; lines are pointed at the one that the test started.
+/// Addresses of a master in the documents; lines are pointed at the master that the test started.
 const SHOWN_MASTERS: [&str; 3] = ["127.0.0.1:7433", "HOST:7433", "master:7433"];
 /// Edge of pictures, frames and pixels that are enough to see that a command works.
 const SMALL: (&str, &str, &str) = ("48x48", "2", "64");

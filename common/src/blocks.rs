@@ -22,7 +22,7 @@ pub struct Block {
     pub tight: TightBox,
     /// Number of relevant voxels in all bricks of the block.
     pub voxels: u64,
-    /// Its bricks, as a range of [`Blocks::places`].
+    /// Bricks of the block, as a range of [`Blocks::places`].
     range: Range<usize>,
 }
 

@@ -45,6 +45,6 @@ id!(
     TaskId(u64), "t"
 );
 id!(
-    /// Which attempt at a task a lease is. A result counts only while its epoch is live.
+    /// Number of an attempt at a task. A result counts only while its epoch is live.
     Epoch(u32), "e"
 );

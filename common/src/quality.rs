@@ -34,7 +34,7 @@ pub enum Compositing {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Splat {
-    /// Its footprint is added directly.
+    /// The section's footprint is added directly.
     Direct,
     /// A small spline is deposited and filtered when the sheet closes. Refused by this version.
     Deposit,

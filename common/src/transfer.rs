@@ -257,7 +257,7 @@ pub struct Classifier {
     summary: ValueSummary,
     payload_max: f64,
     uncapped: bool,
-    /// What opacities are multiplied by, by code of the gradient magnitude; empty if unmodulated.
+    /// Factor of the opacity by code of the gradient magnitude; empty if unmodulated.
     factors: Vec<f64>,
 }
 

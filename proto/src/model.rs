@@ -16,17 +16,17 @@ use std::time::Duration;
 pub enum JobState {
     /// Other jobs come first.
     Queued,
-    /// Its bricks are being cut from the volume.
+    /// Bricks of the job are being cut from the volume.
     Preparing,
-    /// It would run, but no worker is connected.
+    /// The job would run, but no worker is connected.
     WaitingForWorkers,
-    /// Its frames are being rendered.
+    /// Frames of the job are being rendered.
     Running,
     /// All frames are finished.
     Done,
-    /// It can't be finished.
+    /// The job can't be finished.
     Failed,
-    /// It was cancelled.
+    /// The job was cancelled.
     Cancelled,
 }
 

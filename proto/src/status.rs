@@ -19,9 +19,9 @@ pub enum Reason {
     InvalidField,
     /// The client key belongs to another request.
     ClientKeyTaken,
-    /// As many jobs are in progress as the master takes.
+    /// The master has all the jobs in progress that it takes.
     TooManyJobs,
-    /// As many watches are open as the master takes.
+    /// The master has all the watches open that it takes.
     TooManyWatchers,
     /// The master knows no such job.
     JobNotFound,

@@ -49,9 +49,9 @@ struct RegionNeeds {
 /// A message to the master about bricks. The order of messages matters.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum BrickRequest {
-    /// These were dropped to make room.
+    /// Bricks that were dropped to make room.
     Forgotten(BrickSetKey, Vec<BrickId>),
-    /// These are to be sent.
+    /// Bricks that the master must send.
     Wanted(BrickSetKey, Vec<BrickId>),
 }
 

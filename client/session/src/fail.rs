@@ -13,7 +13,7 @@ use std::path::Path;
 #[derive(Debug)]
 pub struct Fail {
     code: u8,
-    /// What goes to stderr after `error: `; nothing where it was said already.
+    /// Text for stderr after `error: `; nothing where it was said already.
     line: Option<String>,
 }
 

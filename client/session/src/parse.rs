@@ -401,7 +401,7 @@ pub fn png(text: &str) -> Result<std::path::PathBuf, String> {
 /// Frames that the user wants: how many, or which.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Frames {
-    /// As many.
+    /// Number of frames, all of which are wanted.
     Count(u32),
     /// The first and the last, both wanted.
     Range([u32; 2]),

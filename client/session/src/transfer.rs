@@ -42,7 +42,7 @@ pub struct TransferFlags {
 pub struct Transfer {
     base: TransferChoice,
     file: Option<PathBuf>,
-    /// What ParaView calls it, if it is ParaView's.
+    /// Title of the function in ParaView's file, if the file is ParaView's.
     title: Option<String>,
     /// The preset that a function came from, where only that is known.
     preset: Option<String>,

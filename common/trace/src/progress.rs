@@ -32,7 +32,7 @@ pub type HasBrick<'a> = &'a dyn Fn(u32) -> bool;
 struct Need {
     /// Nanoseconds of the part's drawing before it.
     after_ns: f64,
-    /// Its place in the set's list.
+    /// Place of the brick in the set's list.
     place: u32,
 }
 

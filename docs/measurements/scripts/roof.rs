@@ -13,7 +13,7 @@
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
-/// What fills two registers, one or a few.
+/// Memory that fills two registers, one or a few.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 struct Line([i16; 32]);
@@ -65,7 +65,7 @@ fn plainly(lines: &mut [Line], row: i16, w: i16) {
 
 type Add = fn(&mut [Line], i16, i16);
 
-/// What the machine has, and its name.
+/// Returns the widest instruction set that the machine has, with its name.
 fn fastest() -> (&'static str, Add) {
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx512bw") {

@@ -49,7 +49,7 @@ pub enum Event {
     },
     /// A message without an event of its own came from a worker.
     WorkerHeard {
-        /// Its sender.
+        /// Worker that sent the message.
         worker: WorkerId,
     },
     /// A worker's link closed.

@@ -25,7 +25,7 @@ pub(crate) struct ActiveJob {
     pub(crate) wanted: BrickNeeds,
     /// One view a frame.
     pub(crate) views: Vec<View>,
-    /// Its bricks, once they are cut.
+    /// Bricks of the job, once they are cut.
     pub(crate) store: Option<Arc<BrickStore>>,
     /// The next frame that was never rendered.
     pub(crate) next: u64,

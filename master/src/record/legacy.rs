@@ -7,7 +7,7 @@ use slabcast_common::message::SceneSpec;
 use slabcast_common::transfer::TransferFunction;
 use slabcast_proto::{cluster_v1 as wire, convert};
 
-/// What format 3 has beside the fields of [`wire::Scene`].
+/// Fields of a scene in format 3 beside those of [`wire::Scene`].
 #[derive(Clone, PartialEq, prost::Message)]
 struct OldScene {
     #[prost(string, tag = "3")]

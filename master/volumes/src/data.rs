@@ -58,7 +58,7 @@ impl<'a> HeaderLines<'a> {
     }
 }
 
-/// How many bytes to skip before the samples.
+/// Number of bytes to skip before the samples.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Skip {
     /// Bytes of the file if the data are raw, else bytes of the decoded data.

@@ -115,7 +115,7 @@ pub(crate) enum Endian {
     Big,
 }
 
-/// How many bytes of samples a reader can have, known before it is read.
+/// Number of bytes of samples that a reader can have, known before it is read.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Supply {
     /// Uncompressed samples.

@@ -17,7 +17,7 @@ pub enum WireError {
     Length {
         /// Path of the field.
         field: String,
-        /// Its length (bytes, or entries).
+        /// Length of the field (bytes, or entries).
         have: usize,
         /// The only one allowed.
         need: usize,
@@ -27,7 +27,7 @@ pub enum WireError {
     TooLong {
         /// Path of the field.
         field: String,
-        /// Its length (bytes, or entries).
+        /// Length of the field (bytes, or entries).
         have: usize,
         /// The largest allowed.
         most: usize,
@@ -37,7 +37,7 @@ pub enum WireError {
     Unknown {
         /// Path of the field.
         field: String,
-        /// Its number.
+        /// Number that stands in the message.
         value: i32,
     },
     /// A value can't be used.

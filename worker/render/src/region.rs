@@ -35,7 +35,7 @@ use slabcast_common::message::{Checkpoint, Counters};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::{parts, split_tile};
 
-/// What all parts of a region are drawn with.
+/// Arguments that all parts of a region are drawn with.
 #[derive(Clone, Copy)]
 struct DrawContext<'a> {
     frame: &'a Frame,

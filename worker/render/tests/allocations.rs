@@ -62,7 +62,7 @@ impl BrickSupply for All<'_> {
     }
 }
 
-/// What one thread keeps from frame to frame.
+/// Memory that one thread keeps from frame to frame.
 struct Kept {
     simd: Simd,
     directory: Arc<Directory>,

@@ -18,7 +18,7 @@ pub(crate) struct Group {
     pub(crate) name: &'static str,
     /// Description of the group, for `--list`.
     pub(crate) about: &'static str,
-    /// Its cases, in the order of the table.
+    /// Cases of the group, in the order of the table.
     pub(crate) cases: fn() -> Vec<Case>,
 }
 

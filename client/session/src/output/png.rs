@@ -69,8 +69,8 @@ pub(crate) fn provenance(bytes: &[u8]) -> std::result::Result<Option<String>, St
     packed.map(|t| t.get_text()).transpose().map_err(|e| e.to_string())
 }
 
-/// Where the number of frames lies in what [`Moving`] writes: after the signature, IHDR, and the
-/// head of `acTL`.
+/// Offset in bytes of the number of frames in the file that [`Moving`] writes: after the signature,
+/// IHDR, and the head of `acTL`.
 const COUNT_AT: usize = 8 + 25 + 8;
 
 /// A moving PNG in the making.

@@ -106,7 +106,7 @@ impl Provenance {
         }
     }
 
-    /// As it stands in a picture's file, or in that of a moving picture.
+    /// Returns the provenance as JSON for a picture's file, or for that of a moving picture.
     pub(super) fn written(mut self, frame: &Frame) -> String {
         // Of a single frame, that does not say it in another way.
         if self.view_sha256.is_some() && self.pixels_sha256.is_none() {

@@ -444,7 +444,8 @@ fn halt(before: DVec3, after: DVec3, mix: f64) -> DVec3 {
     }
 }
 
-/// The same for a number, which also turns round without running over.
+/// Mixes the speeds of a number before and after a key; the number also turns round without running
+/// over.
 fn halt_1d(before: f64, after: f64, mix: f64) -> f64 {
     if before * after <= 0.0 {
         return 0.0;

@@ -28,7 +28,7 @@ pub(super) fn exp(v: DVec3) -> DQuat {
     DQuat::from_xyzw(v.x * k, v.y * k, v.z * k, cos(angle / 2.0))
 }
 
-/// What turns `a` into `b`, as axis times angle in `a`'s own axes.
+/// Returns the rotation that turns `a` into `b`, as axis times angle in `a`'s own axes.
 pub(super) fn from_to(a: DQuat, b: DQuat) -> DVec3 {
     log(a.conjugate() * b)
 }

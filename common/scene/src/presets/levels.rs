@@ -26,7 +26,7 @@ use std::ops::Range;
 /// the leaves and the air of a plant is gone.
 const SMOOTH: f64 = 0.015;
 
-/// How many times higher both sides of a valley must be.
+/// Least ratio of the counts on both sides of a valley to its floor.
 const DEPTH: f64 = 1.5;
 
 /// Factor of the lowest bin below which a bin belongs to the valley's floor.
@@ -122,7 +122,7 @@ fn unit_histogram(s: &ValueSummary) -> Vec<(f64, f64)> {
     bins
 }
 
-/// What `share` of the samples at or above `from` do not exceed.
+/// Returns the value that `share` of the samples at or above `from` do not exceed.
 fn quantile(bins: &[(f64, f64)], from: f64, share: f64) -> f64 {
     let above = || bins.iter().filter(|b| b.0 >= from);
     let all: f64 = above().map(|b| b.1).sum();
@@ -136,7 +136,8 @@ fn quantile(bins: &[(f64, f64)], from: f64, share: f64) -> f64 {
     1.0
 }
 
-/// What is there, where the air ends and where a surface is opaque. At least two bins.
+/// Returns the kind of foreground, where the air ends and where a surface is opaque. There must be
+/// two bins or more.
 fn ramp(bins: &[(f64, f64)]) -> (Content, f64, f64) {
     let total: f64 = bins.iter().map(|b| b.1).sum();
     // Saturated samples pile up in the last bin and are no hill of their own.
@@ -204,8 +205,8 @@ fn smooth(bins: &[(f64, f64)], n: &[f64], part: Range<usize>) -> Vec<(f64, f64)>
     part.clone().map(of).collect()
 }
 
-/// Where the deepest valley of smoothed counts is, looked for in the first `among` of them. The
-/// first of all is one where counts rise from there.
+/// Returns the deepest valley among the first `among` of the smoothed counts. The very first is one
+/// where counts rise from there.
 fn deepest(counts: &[(f64, f64)], among: usize) -> Option<usize> {
     let mut best: Option<(f64, usize)> = None;
     let mut left = f64::INFINITY;

@@ -12,9 +12,9 @@ use std::collections::BTreeMap;
 
 /// A frame that is done.
 pub(crate) struct Done {
-    /// Its picture, if results were sums.
+    /// Picture of the frame, if results were sums.
     pub(crate) picture: Option<Picture>,
-    /// Its encoded picture, if workers may finish pixels.
+    /// Encoded picture of the frame, if workers may finish pixels.
     pub(crate) bytes: Option<Vec<u8>>,
     pub(crate) stats: FrameStats,
     pub(crate) spans: Vec<Span>,

@@ -64,7 +64,7 @@ impl Series {
 
 /// The series to read.
 pub(crate) struct SeriesChoice<'a> {
-    /// Its number, description, name or UID.
+    /// Number, description, name or UID of the wanted series.
     pub(crate) series: Option<&'a str>,
     /// A slice of it.
     pub(crate) file: Option<&'a Path>,

@@ -14,7 +14,7 @@ use slabcast_common::image::SparseTile;
 /// Compression of finished pixels on their way to the master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Compression {
-    /// They are not: the link has room, and compressing takes longer than it saves.
+    /// No compression: the link has room, and compressing takes longer than it saves.
     None,
     /// By LZ4, where that makes them fewer bytes.
     Lz4,

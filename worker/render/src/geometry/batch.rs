@@ -19,7 +19,7 @@ pub struct Batch {
     pub(crate) samples: Each<u32>,
     pub(crate) normals: Each<u16>,
     pub(crate) apart: Apart,
-    /// What is open where its sections lie: 0 if nothing is.
+    /// Open pixels where the sections of each voxel lie: 0 if there are none.
     pub(crate) near: Each<u64>,
     light: [Each<f32>; 4],
 }

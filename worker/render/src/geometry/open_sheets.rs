@@ -212,7 +212,7 @@ impl<'a, V> Due<'a, V> {
 }
 
 impl<V> Chunk<'_, V> {
-    /// How many.
+    /// Returns the number of voxels.
     #[inline(always)]
     pub(crate) fn len(&self) -> usize {
         match self {
@@ -324,7 +324,8 @@ struct Sifting {
 }
 
 impl Sifting {
-    /// It takes a tenth of what closing does, and a pixel by itself; so it pays from here on.
+    /// Sifting pays from one dropped pixel in this many: it takes a tenth of what closing does, and
+    /// a pixel by itself.
     const PAYS: usize = 5;
 
     /// Sheets that go by where it does not.
@@ -405,8 +406,8 @@ impl<S: Recorded> Closes<S> {
         some.any_shut
     }
 
-    /// What comes before a sheet that is touched at some pixels and closes at some is there from
-    /// here on.
+    /// Clears the sums before a sheet where it closes and the sheet in front had nothing; notes
+    /// where it was touched.
     #[inline(always)]
     fn begin_sheet(&mut self, closing: &Rows, touched: &Rows) {
         let Closes { before, was, .. } = self;

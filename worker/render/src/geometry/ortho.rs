@@ -142,8 +142,8 @@ impl<S: Recorded, const N: usize> Work for RenderOrtho<'_, S, N> {
     }
 }
 
-/// What a voxel's brick is among a part's, which pixels are open, where voxels wait, and what is
-/// counted.
+/// Arguments of a toss: a voxel's brick among the part's, the open pixels, the queues and the
+/// counts.
 pub(crate) type Asked<'a> = (usize, &'a OpenMask, &'a mut Queues<Splat>, &'a mut Counters);
 
 /// [`Stage::toss`] for integer positions.
@@ -192,7 +192,7 @@ struct FlatStage<'a, S: Recorded> {
     part: &'a Part<'a>,
     simd: Simd,
     flat: &'a Flat,
-    /// Where weights across and down lie.
+    /// Layouts of the weights across and down.
     phases: [Phases; 2],
     tables: Tables<'a, S>,
     tossing: &'a mut Tossing,

@@ -32,7 +32,7 @@ use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, round_i32};
 pub(crate) struct DeepVoxel {
     /// Eye coordinates in vox.
     eye: [f64; 3],
-    /// Its sample's bits.
+    /// Sample code of the voxel, as bits.
     sample: u32,
     normal: u16,
     /// The pixel of the part that is nearest to its centre: [`OpenMask::near_all`].
@@ -48,11 +48,11 @@ pub(crate) struct Waiting {
     places: Box<Places>,
 }
 
-/// Where voxels of a batch are.
+/// Positions of the voxels of a batch.
 struct Places {
     /// Eye coordinates.
     eye: [Each<f64>; 3],
-    /// Where a section of each is along an axis.
+    /// Position of a section of each voxel along an axis.
     aside: Each<f64>,
     /// In a level view, which lattice row each belongs to, the columns that hold its sections, and
     /// by slot where among all tiers of a sheet it begins.
@@ -214,7 +214,7 @@ impl<'a, S: Recorded, const N: usize> DeepStage<'a, S, N> {
 struct Footprints<'a, S: Recorded, const N: usize> {
     axes: Axes<'a, S, N>,
     scales: [f64; N],
-    /// Which sheet's each slot has.
+    /// Sheet whose footprint each slot has.
     sheets: [i32; N],
 }
 
@@ -227,8 +227,8 @@ impl<'a, S: Recorded, const N: usize> Footprints<'a, S, N> {
         Footprints { axes, scales: [footprint.scale; N], sheets: [k; N] }
     }
 
-    /// Those of the sheets from `k` that a voxel may reach: from one sheet to the next only one of
-    /// them is new.
+    /// Takes the footprints of the sheets from `k` that a voxel may reach: from one sheet to the
+    /// next only one of them is new.
     #[inline(always)]
     fn come_to(&mut self, part: &'a Part<'_>, k: i32) {
         let footprints = &part.frame.footprints;
@@ -247,7 +247,7 @@ impl<'a, S: Recorded, const N: usize> Footprints<'a, S, N> {
     }
 }
 
-/// What [`takes`] has found out.
+/// Message for a sheet without a footprint: [`takes`] has excluded it.
 const DRAWN: &str = "no sheet of the part is clipped";
 
 impl<S: Recorded, const N: usize> Drawing<'_, S, N> {
@@ -367,8 +367,8 @@ impl<S: Recorded, const N: usize> Drawing<'_, S, N> {
         (samples[i], normals[i], apart.left[i]) = (v.sample, v.normal, left);
     }
 
-    /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all
-    /// of a voxel's, along some axes: rows before columns, which may hang on them.
+    /// Places each section of the first `n` voxels of the batch, and the windows that hold all of a
+    /// voxel's, along some axes: rows before columns, which may depend on them.
     #[inline(always)]
     fn place(
         &mut self,

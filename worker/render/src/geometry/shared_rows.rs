@@ -27,7 +27,7 @@ use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS};
 
 /// The tiers that reach each row of a part's pixels in one sheet, and what they weigh there.
 struct Down<'a, W> {
-    /// Which sheet this is, and the lattice row of its first tier.
+    /// Number of the sheet.
     k: i32,
     base: i32,
     weights: &'a [W],
@@ -41,7 +41,7 @@ struct Down<'a, W> {
     /// would lie.
     first: [i32; ROWS],
     from: [i32; ROWS],
-    /// What tiers weigh in rows that are known.
+    /// Rows whose tiers and weights are known, one bit each.
     known: u64,
     by_row: ByRow<W>,
 }
@@ -117,7 +117,7 @@ impl<'a, W: Weight> Down<'a, W> {
         }
     }
 
-    /// What tiers weigh in some rows at least.
+    /// Computes the weights of tiers, in these rows at least.
     #[inline(always)]
     fn know(&mut self, rows: u64) {
         let mut left = rows & !self.known;
@@ -258,8 +258,8 @@ impl<'a, S: Tiered, const N: usize> SharedRowsSheets<'a, S, N> {
     }
 }
 
-/// What is open where lattice rows reach in the sheets from one on, and where something was added
-/// to them.
+/// Open columns where lattice rows reach in the sheets from one on, and columns that something was
+/// added to.
 pub(crate) struct Hull {
     /// The first of the sheets, how many there are, and the lattice row of each one's first tier.
     k: i32,
@@ -469,7 +469,7 @@ pub struct RenderSharedRows<'a, S: Recorded, const N: usize> {
     pub(crate) io: Io<'a>,
 }
 
-/// What drawing parts of an orthographic view with a level camera takes.
+/// Constants for drawing parts of an orthographic view with a level camera.
 #[derive(Clone, Copy)]
 pub(crate) struct SharedRowsView<'a> {
     flat: &'a Flat,
@@ -536,7 +536,7 @@ struct LevelStage<'a, S: Recorded> {
     part: &'a Part<'a>,
     simd: Simd,
     flat: &'a Flat,
-    /// Where weights across lie.
+    /// Layout of the weights across.
     phases: Phases,
     shape: Shape,
     tier_of: TierOf,

@@ -147,8 +147,8 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
         apart.deep[i] = v.phase() * most as u32 + (most - left) as u32;
     }
 
-    /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all
-    /// of a voxel's.
+    /// Places each section of the first `n` voxels of the batch, and the windows that hold all of a
+    /// voxel's.
     #[inline(always)]
     fn place(&mut self, n: usize, k: i32) {
         let n = whole_registers::<BATCH>(n);

@@ -16,7 +16,7 @@ pub(super) use x86::{Eight, Sixteen};
 
 /// An instruction set's lanes. No function may be called on a machine that lacks its instructions.
 pub(crate) trait Lanes {
-    /// How many there are.
+    /// Number of lanes.
     const LANES: usize;
     /// A whole number each.
     type Ints: Copy;
@@ -56,7 +56,7 @@ pub(crate) trait Lanes {
     /// The `at`th numbers of `table`, in lanes that are marked; of others no more than the table's
     /// first is read.
     unsafe fn look_up(marks: Self::Marks, table: *const u32, at: Self::Ints) -> Self::Ints;
-    /// Those of `bits` beside each other, from the first lane on.
+    /// Returns the numbers whose lanes are set in `bits`, side by side from the first lane on.
     unsafe fn beside(bits: u32, a: Self::Ints) -> Self::Ints;
     /// The first ones in the lanes of `bits`.
     unsafe fn spread(bits: u32, a: Self::Ints) -> Self::Ints;
@@ -72,13 +72,13 @@ pub(crate) trait Lanes {
     /// Four numbers from each of as many places as there are lanes: the first of all places, the
     /// second, and so on. The `i`th begins at the `at[i] * stride`th number behind `from`.
     unsafe fn fours(from: *const u32, stride: usize, at: *const u32) -> [Self::Ints; 4];
-    /// The same of places that follow each other, from `from` on.
+    /// Reads four numbers each of places that follow each other, from `from` on.
     unsafe fn fours_on(from: *const u32) -> [Self::Ints; 4];
     /// [`Lanes::fours`] of two numbers, which are all that each place has.
     unsafe fn pairs(from: *const u32, at: *const u32) -> [Self::Ints; 2];
-    /// The same of places that follow each other, from `from` on.
+    /// Reads two numbers each of places that follow each other, from `from` on.
     unsafe fn pairs_on(from: *const u32) -> [Self::Ints; 2];
-    /// The same of two numbers behind each of two `from`s: four.
+    /// Reads two numbers each behind two `from`s: four in all.
     unsafe fn twos(from: [*const u32; 2], stride: usize, at: *const u32) -> [Self::Ints; 4];
     /// Whole numbers as floats.
     unsafe fn store_floats(to: *mut f32, a: Self::Ints);

@@ -67,7 +67,8 @@ pub trait Weight: Copy + Default + PartialEq + std::fmt::Debug {
         clip: (i32, i32),
         buffer: &'b mut Vec<Self>,
     ) -> (i32, &'b [Self]);
-    /// What makes sums of rows that are kept over a length of `spread`: see `lattice_rows`.
+    /// Returns the weight for sums of rows that are kept over a length of `spread`: see
+    /// `lattice_rows`.
     #[must_use]
     fn of_rows(self, spread: f32) -> Self;
 }
@@ -116,7 +117,7 @@ pub trait Accumulate: Sum {
     type Weight: Weight;
     /// One channel of a section or a row.
     type Section: Copy;
-    /// What [lattice rows](Accumulate::down) add up to on the way; the default is nothing.
+    /// Running sum of [lattice rows](Accumulate::down); the default is nothing.
     type Way: Copy + Default;
 
     /// First sheet of a voxel at depth `z` (in phases), and its section in the `i`th from there.
@@ -128,10 +129,10 @@ pub trait Accumulate: Sum {
     fn plus(self, row: Self::Section, wx: Self::Weight) -> Self;
     /// `way + row * wy`.
     fn on(way: Self::Way, row: Self, wy: Self::Weight) -> Self::Way;
-    /// What it is in the end.
+    /// Returns the sum that a running sum ends in.
     fn end(way: Self::Way) -> Self;
-    /// What a pixel has of lattice rows, each times its weight [for rows](Weight::of_rows), in
-    /// their order.
+    /// Returns the sum of lattice rows at a pixel, each times its weight [for
+    /// rows](Weight::of_rows), in their order.
     #[inline(always)]
     fn down(rows: impl Iterator<Item = (Self, Self::Weight)>) -> Self {
         Self::end(rows.fold(Self::Way::default(), |way, (row, wy)| Self::on(way, row, wy)))

@@ -39,7 +39,7 @@ pub trait BrickSupply {
 pub(crate) struct TakenBrick {
     brick: Arc<Brick>,
     corner: Corner,
-    /// Its index in the directory.
+    /// Index of the brick in the directory.
     pub(crate) place: u32,
     first_sheet: i32,
 }
@@ -108,14 +108,14 @@ pub(crate) struct WaitingBricks {
     bricks: Vec<WaitingBrick>,
     /// Voxels of the bricks in the lists.
     voxels: u64,
-    /// How many of the part's blocks, front to back, were opened or culled.
+    /// Number of the part's blocks, front to back, that were opened or culled.
     blocks_done: usize,
 }
 
 #[derive(Clone, Copy)]
 struct WaitingBrick {
     block: u32,
-    /// Its index in the block.
+    /// Index of the brick in its block.
     index: u32,
     /// The next brick that begins at the same sheet, or [`NONE`].
     next: u32,
@@ -337,7 +337,7 @@ impl<'a> ArrivingBricks<'a> {
         self.nearest
     }
 
-    /// How many bricks were taken.
+    /// Returns the number of bricks that were taken.
     pub(crate) fn taken_count(&self) -> usize {
         self.taken.len()
     }

@@ -145,7 +145,7 @@ impl Sections {
         (self.first(z), &self.fixed[row..row + count])
     }
 
-    /// Where the weights of depth `z` begin, and how many there are.
+    /// Returns the index at which the weights of depth `z` begin, and their number.
     #[inline(always)]
     pub(crate) fn row(&self, z: i32) -> (usize, usize) {
         ((z & (self.phases - 1)) as usize * self.stride, self.span(z).1 as usize)
@@ -205,7 +205,7 @@ pub struct Slant<'a> {
     /// Offsets of a voxel's sections along x and y, in subpixels: for each depth phase as many as
     /// weights.
     pub subpixels: [&'a [i32]; 2],
-    /// Where weights across and down lie.
+    /// Layouts of the weights across and down.
     pub(crate) phases: [Phases; 2],
     /// Slope of x over y of the sheared kernel in units of 2^-16 ([`Lean::row_fixed`]): less than
     /// 2^20 either way.
@@ -396,7 +396,7 @@ fn weight(profile: &Profile, scale: f64, p: i32, i: i64) -> f64 {
 /// through that, it goes one farther at most.
 #[derive(Clone, Copy, Debug)]
 struct First {
-    /// That of the first phases.
+    /// First pixel of the first phases, relative to the pixel that holds the centre.
     near: i32,
     /// The phase from which it is one more.
     more_from: i32,
@@ -591,7 +591,7 @@ impl Shelf {
     }
 }
 
-/// What a shelf has under `key`, or else what is made now. A shelf of `most` is cleared.
+/// Returns the shelf's entry under `key`, or else makes it. A shelf of `most` entries is cleared.
 fn shelved<K: Ord, V>(
     shelf: &Mutex<BTreeMap<K, Arc<V>>>,
     most: usize,

@@ -114,7 +114,8 @@ impl LatticeRows {
         }
     }
 
-    /// Which lattice row, counted from the top, lies at `y` vox down the eye's axis: a fraction.
+    /// Returns the lattice row, counted from the top and as a fraction, that lies at `y` vox down
+    /// the eye's axis.
     #[inline(always)]
     fn of_eye(&self, y: f64) -> f64 {
         (y - self.eye[0]) / self.step

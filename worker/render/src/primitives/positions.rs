@@ -15,7 +15,7 @@ use slabcast_common::view::{Projection, SUBPIXELS, View, round_i64};
 pub(crate) const FINER_BITS: u32 = 24;
 const FINER: f64 = (1u32 << FINER_BITS) as f64;
 
-/// What rounds a sum of a corner and an offset to the nearest subpixel or phase. A little more than
+/// Summand that rounds a corner plus an offset to the nearest subpixel or phase. A little more than
 /// half: positions half-way between two are common (a voxel on a pixel's edge), and the last bits
 /// of corner and offset must not say where those go.
 const HALF: i64 = (1 << (FINER_BITS - 1)) + 64;

@@ -77,7 +77,7 @@ impl Directory {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct VisibleBrick {
     pub(crate) projected: Projected,
-    /// Its index in the directory.
+    /// Index of the brick in the directory.
     pub(crate) place: u32,
     pub(crate) voxels: u16,
 }
@@ -87,7 +87,7 @@ pub(crate) struct VisibleBrick {
 pub(crate) struct ProjectedBlock {
     pub(crate) projected: Projected,
     pub(crate) voxels: u64,
-    /// Its index among the directory's blocks.
+    /// Index of the block among the directory's.
     block: u32,
     bricks: OnceLock<Vec<VisibleBrick>>,
 }

@@ -157,7 +157,7 @@ fn extinctions_from_faint_to_stiff_stay_within_rounding_bounds() {
     }
 }
 
-/// Where voxels miss the subpixels, rounded positions are the largest error, and have a bound.
+/// Rounded positions are the largest error where voxels miss the subpixels, and have a bound.
 #[test]
 fn off_grid_wall_stays_within_position_rounding_bound() {
     let (n, scale) = (10, 3.7);

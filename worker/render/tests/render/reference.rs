@@ -614,7 +614,7 @@ fn reference_spline_kernels_equal_closed_forms() {
     }
 }
 
-/// What rounded positions and the kernel's cut cost at most, held against every pixel of scenes
+/// Bounds the cost of rounded positions and of the kernel's cut, held against every pixel of scenes
 /// that are soft and stiff, even and rough, seen along an axis (walls that rays graze), from
 /// anywhere and in perspective.
 #[test]

@@ -50,7 +50,7 @@ fn limit(reference: &Reference, sample: &[[u32; 2]]) -> Vec<[f64; 4]> {
     reference.pixels(sample)
 }
 
-/// The same sheets in f64.
+/// Returns the reference's pixels in f64 sheets of the view's thickness.
 fn same_sheets(reference: &Reference, sample: &[[u32; 2]]) -> Vec<[f64; 4]> {
     sample.iter().map(|&[x, y]| reference.at_same_thickness(x, y)).collect()
 }

@@ -145,8 +145,8 @@ fn slack(ready: &PreparedShot) -> f64 {
     sheets(ready) * (0.5 / f64::from(1u32 << 24) + 0.5 / f64::from(1u32 << 28)) + 1e-6
 }
 
-/// What a pixel that goes on may gain on one that was shut: eps, and what f32 and fixed-point
-/// colour round in each sheet behind.
+/// Returns how much a pixel that goes on may gain on one that was shut: eps, and the rounding of
+/// f32 and fixed-point colour in each sheet behind.
 pub(super) fn cutoff_bound(ready: &PreparedShot) -> f64 {
     bounds::cutoff(&ready.spec.quality) + 255.0 * slack(ready)
 }

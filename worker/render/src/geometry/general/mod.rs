@@ -24,11 +24,11 @@ use slabcast_common::view::Projection;
 /// A voxel waiting in the bucket of its first sheet.
 #[derive(Clone, Copy, Default)]
 pub struct Waiting {
-    /// Which of the part's bricks.
+    /// Index of the voxel's brick among the part's.
     brick: u32,
-    /// Which voxel of it.
+    /// Index of the voxel in its brick.
     voxel: u16,
-    /// Where it lies.
+    /// Position of the voxel.
     placed: Placed,
 }
 
@@ -221,7 +221,7 @@ impl General<'_> {
         }
     }
 
-    /// Where a voxel's footprints lie, all sections together, a pixel more at most.
+    /// Returns the rectangle of a voxel's footprints, all sections together, a pixel more at most.
     #[inline(always)]
     fn extent(&self, placed: &Placed) -> Option<Rect> {
         let frame = self.part.frame;

@@ -14,7 +14,7 @@ pub(crate) const BLOCK: usize = 8;
 /// A voxel's footprint, inside the part: first column and weights, first row and weights.
 pub(crate) type Window<'a, W> = ((usize, &'a [W]), (usize, &'a [W]));
 
-/// Which blocks a window touches, one bit each.
+/// Returns the blocks that a window touches, one bit each.
 #[inline(always)]
 fn blocks<W>(((x0, wx), (y0, wy)): Window<'_, W>) -> u64 {
     let (bx0, bx1) = (x0 / BLOCK, (x0 + wx.len() - 1) / BLOCK);
@@ -50,7 +50,7 @@ pub(crate) struct Lofts<S> {
     sheets: Vec<Loft<S>>,
 }
 
-/// Those of one sheet.
+/// Lattice rows of one sheet.
 struct Loft<S> {
     /// The sheet, and the lattice row that row 0 stands for.
     k: i32,
@@ -116,8 +116,8 @@ impl<S: Accumulate> Lofts<S> {
         lattice_rows.iter().filter_map(row).fold(0, |all, touched| all | touched)
     }
 
-    /// What these lattice rows, each with its weight, add up to in the [`BLOCK`] columns of sheet
-    /// `k` from `x` on.
+    /// Returns the weighted sum of these lattice rows in the [`BLOCK`] columns of sheet `k` from
+    /// `x` on.
     #[inline(always)]
     pub(crate) fn down(
         &self,

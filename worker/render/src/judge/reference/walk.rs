@@ -91,7 +91,7 @@ pub struct Near {
     /// From the voxel to where the ray passes the plane z = 0.
     pub(super) x: f64,
     pub(super) y: f64,
-    /// Its depth.
+    /// Depth of the voxel, in vox.
     pub(super) z: f64,
     /// Extinction times the cell, and that times the three colours. For parallel rays times the
     /// profiles across, which are the same all along.
@@ -192,7 +192,8 @@ impl<'a> Walk<'a> {
         }
     }
 
-    /// Where the next voxel is of use at or behind `z`; forgets those that end before it.
+    /// Returns the depth at or behind `z` from which the next voxel counts; forgets voxels that end
+    /// before it.
     pub(super) fn next_depth(&mut self, z: f64) -> Option<f64> {
         self.voxels.retain(|v| v.leave > z);
         loop {

@@ -224,7 +224,7 @@ impl Rule {
     }
 }
 
-/// What [`Rule::slopes`] gives.
+/// Slopes of colour in a sheet, as [`Rule::slopes`] computes them.
 struct Slopes {
     /// Weight of the sheet before, and what makes a colour of its sums.
     before: f32,

@@ -125,7 +125,7 @@ mod wide {
         }
     }
 
-    /// What some pixels have before their colours are looked at.
+    /// State of some pixels before their colours are looked at.
     #[derive(Clone, Copy)]
     struct Pixels<F> {
         raw: F,
@@ -138,7 +138,7 @@ mod wide {
         before: F,
         per_before: F,
         behind: F,
-        /// What of the light comes through from the sheet on.
+        /// Share of light that comes through from the sheet on.
         light: F,
     }
 

@@ -4,7 +4,7 @@ use super::{BESIDE, Floats, Lanes, SPREAD, first};
 use crate::kernels::by_column;
 use std::arch::x86_64::*;
 
-/// Where the numbers of place `*at` begin.
+/// Returns where the numbers of place `*at` begin.
 ///
 /// # Safety
 /// They are there.

@@ -20,8 +20,8 @@ pub(super) mod avx2 {
     /// Registers of a record at most: eight sums each.
     pub(in super::super) const PARTS: usize = MOST / 2;
 
-    /// Which of a row's weights in depth each of the eight lanes of a register takes: that of its
-    /// slot.
+    /// Returns which of a row's weights in depth each of the eight lanes of a register takes: that
+    /// of its slot.
     #[target_feature(enable = "avx2")]
     #[inline]
     fn turns<const C: usize, const N: usize>(slot: usize) -> [__m256i; PARTS] {
@@ -36,7 +36,7 @@ pub(super) mod avx2 {
         turns
     }
 
-    /// What `splat_all` is called with, in one.
+    /// Arguments of `splat_all`, in one.
     pub(super) type At<'a, const C: usize, const N: usize> =
         (&'a mut [[[i32; C]; N]], (&'a [Splat], &'a [[f32; C]]), usize, &'a Tables<'a, i32>);
 

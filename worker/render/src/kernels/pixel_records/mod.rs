@@ -27,7 +27,8 @@ macro_rules! by_window {
     };
 }
 
-/// The same where columns may be alike: then windows are as wide as footprints are.
+/// Calls a function by the width of its windows where columns may be alike: windows are then as
+/// wide as footprints.
 #[cfg(target_arch = "aarch64")]
 macro_rules! by_window_alike {
     ($wide:expr, $side_by_side:ident[$($of:ident),*], $at:expr) => {
@@ -167,19 +168,20 @@ impl Splat {
         self.place >> 16
     }
 
-    /// Its normal.
+    /// Returns the voxel's normal code.
     #[inline(always)]
     pub(crate) fn normal(&self) -> u16 {
         (self.deep >> 16) as u16
     }
 
-    /// Where it is itself, in subpixels from the part's corner: less than 2^15 of them.
+    /// Returns the voxel's own position, in subpixels from the part's corner: less than 2^15 of
+    /// them.
     #[inline(always)]
     pub(crate) fn aside_of(&self) -> [i32; 2] {
         [i32::from(self.rows as i16), self.rows as i32 >> 16]
     }
 
-    /// Its depth in phases from its sheet's front.
+    /// Returns the voxel's depth in phases from its sheet's front.
     #[inline(always)]
     pub(crate) fn phase(&self) -> u32 {
         self.deep & 0xffff
@@ -192,7 +194,7 @@ impl Splat {
         y * STRIDE + x
     }
 
-    /// Its weights.
+    /// Returns the voxel's weights across, down and in depth.
     #[inline(always)]
     pub(crate) fn weights<'a, S: Recorded>(&self, tables: &Tables<'a, S>) -> Weights<'a, S> {
         let [x, y] = &tables.across;
@@ -227,15 +229,15 @@ impl<'a, W> RowAt<'a, W> {
     /// A row without a weight.
     pub const NONE: Self = RowAt { table: &[], from: 0, len: 0, column: 0 };
 
-    /// The same beside a table. A load of no lanes takes a machine hundreds of cycles where nothing
-    /// is that it could have read.
+    /// Returns a row without a weight beside a table. A load of no lanes takes a machine hundreds
+    /// of cycles where the address is invalid.
     #[inline(always)]
     pub(crate) fn none_of(table: &'a [W]) -> Self {
         RowAt { table, ..RowAt::NONE }
     }
 
-    /// Which of the first 16 columns it has a weight for, a bit each, and where that of the first
-    /// column would be.
+    /// Returns which of the first 16 columns the row has a weight for, a bit each, and where the
+    /// weight of the first column would be.
     #[inline(always)]
     fn columns(&self) -> (u16, *const W) {
         let row = self.row();
@@ -348,7 +350,7 @@ pub trait Recorded: Accumulate {
     }
 }
 
-/// What pixels of four sums have in common.
+/// Implements the members that all sums of four channels share.
 macro_rules! four_sums {
     () => {
         type Pixel = [Self; 4];

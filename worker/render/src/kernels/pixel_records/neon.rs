@@ -26,7 +26,7 @@ type Parts<S> = [<S as InLanes>::Lanes; PARTS];
 pub(in super::super) trait InLanes: Recorded {
     /// Numbers of a register.
     type Lanes: Copy;
-    /// How many those are.
+    /// Number of lanes of a register.
     const LANES: usize;
 
     /// # Safety
@@ -115,7 +115,7 @@ impl InLanes for i16 {
     }
 }
 
-/// What is the same for all 32-bit sums.
+/// Implements the members that all 32-bit sums share.
 macro_rules! four_lanes {
     () => {
         type Lanes = float32x4_t;
@@ -316,7 +316,7 @@ fn add<S: InLanes, const N: usize>(record: &mut Record<S, N>, row: &Parts<S>, w:
     }
 }
 
-/// What [`splat_all`] is called with, in one.
+/// Arguments of [`splat_all`], in one.
 type At<'a, S, const N: usize> = (
     &'a mut [Record<S, N>],
     (&'a [Splat], &'a [<S as Recorded>::Payload]),
@@ -336,7 +336,7 @@ pub(super) fn splat_all<S: InLanes, const N: usize>(
     by_width!(tables.across[0].len, all[S, N], at, all::<0, S, N>(at))
 }
 
-/// The same of [`Grey`], with the tables of the sums that it is bit for bit.
+/// Splats sums of [`Grey`], with the tables of the sums that it equals bit for bit.
 #[target_feature(enable = "neon")]
 pub(super) fn splat_grey<const N: usize>(
     records: &mut [Record<Grey, N>],

@@ -178,8 +178,8 @@ mod lean {
     use crate::kernels::lanes::{Eight, Lanes, Sixteen};
     use crate::kernels::pixel_records::MOST;
 
-    /// Where sections lie by slot, and of the voxels where weights in depth begin and where they
-    /// are; how far sections lie aside.
+    /// Arguments of a lean: positions of sections by slot, indices of voxels' weights in depth,
+    /// positions of voxels, and offsets of sections.
     type At<'a> = (&'a mut [Each<i32>; MOST], &'a Each<u32>, &'a Each<i32>, &'a [i32]);
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
@@ -303,7 +303,7 @@ impl<W: Copy + Default, const N: usize> Default for Woven<W, N> {
     }
 }
 
-/// What [`Recorded::splat_apart`] adds, where and by which weights, for windows of a known width.
+/// Arguments of [`Recorded::splat_apart`] for windows of a known width.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 pub(super) type ApartAt<'a, S, const N: usize> = (
     &'a mut [Record<S, N>],
@@ -334,7 +334,7 @@ pub(super) fn splat_apart<S: Recorded, const N: usize>(
     }
 }
 
-/// Where the middle of row `y` is along x of a footprint at `place`, in subpixels; `row`:
+/// Returns the middle along x, in subpixels, of row `y` of a footprint at `place`; `row` is
 /// [`Lean::row_fixed`].
 #[inline(always)]
 pub(crate) fn along_row(row: i64, [x, y_of]: [i32; 2], y: i32) -> i32 {
@@ -412,9 +412,9 @@ pub(super) mod lines {
     /// have few voxels: they stay where they are from one to the next, and what is of no voxel at
     /// hand is anything.
     pub(crate) struct Spans<const N: usize> {
-        /// Which pixels of a window there are any for, a bit each.
+        /// Pixels of a window that have a weight, a bit each.
         present: [Each<u32>; N],
-        /// Where that of a window's first pixel would be.
+        /// Index at which the weight of a window's first pixel would be.
         at: [Each<i32>; N],
     }
 
@@ -506,16 +506,16 @@ pub(super) mod lines {
             Lines { spans, weights }
         }
 
-        /// Which weights of voxel `i` there are in `slot`, a bit each, and where that of the first
-        /// pixel would lie.
+        /// Returns which weights of voxel `i` there are in `slot`, a bit each, and where that of
+        /// the first pixel would lie.
         #[inline(always)]
         pub(crate) fn of(&self, slot: usize, i: usize) -> (u32, *const W) {
             let from = self.weights[slot].as_ptr();
             (self.spans.present[slot][i], from.wrapping_offset(self.spans.at[slot][i] as isize))
         }
 
-        /// The same, and [`LINE`] weights from that of the first pixel on, where the table has them
-        /// all.
+        /// Returns [`Lines::of`] with [`LINE`] weights from that of the first pixel on, where the
+        /// table has them all.
         #[inline(always)]
         pub(crate) fn around(&self, slot: usize, i: usize) -> (u32, Option<&'a [W; LINE]>) {
             let around = usize::try_from(self.spans.at[slot][i]).ok();

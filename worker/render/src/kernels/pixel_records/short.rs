@@ -66,7 +66,7 @@ pub(super) mod avx2 {
         }
     }
 
-    /// Which of a voxel's weights in depth each lane takes, that of its slot, by bytes.
+    /// Returns which of a voxel's weights in depth each lane takes, by bytes: that of its slot.
     #[target_feature(enable = "avx2")]
     #[inline]
     pub(in super::super) fn turns<const N: usize>(slot: usize) -> [__m256i; PARTS] {
@@ -553,7 +553,7 @@ pub(super) mod avx512 {
         _mm512_permutexvar_epi16(turn, _mm512_castsi128_si512(weights))
     }
 
-    /// The same weights for all pixels of a register.
+    /// Returns a register in which all pixels have the same weights.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     fn spread_same<const N: usize>(weights: &BySlot<i16, N>) -> __m512i {

@@ -15,8 +15,8 @@ pub(super) struct Longs<const C: usize>;
 
 compiled!("avx512f,avx512vl,avx512dq,avx512bw,popcnt,bmi2");
 
-/// Which of the weights from `chunk` times `of` on are those of a footprint of `len` columns that
-/// begins at `shift`.
+/// Returns which of the weights from `chunk` times `of` on belong to a footprint of `len` columns
+/// that begins at `shift`.
 #[inline(always)]
 fn present(len: usize, shift: usize, chunk: usize, of: usize) -> u64 {
     let len_mask = (1u64 << len) - 1;

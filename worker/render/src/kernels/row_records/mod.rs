@@ -43,8 +43,8 @@ const fn a_line<S: Recorded>() -> usize {
     size_of::<Line>() / size_of::<S::Pixel>()
 }
 
-/// How many groups of so many columns a footprint of `len` may reach: it may begin in the last
-/// column of the first.
+/// Returns how many groups of `columns` columns a footprint of `len` may reach: it may begin in the
+/// last column of the first.
 #[inline(always)]
 fn groups(len: usize, columns: usize) -> usize {
     (len + columns - 1).div_ceil(columns)
@@ -190,7 +190,8 @@ pub struct Folded<S: Recorded> {
 /// the lanes behind the last one few are spent.
 const ENOUGH: usize = 512;
 
-/// As many, and as many as are stored at once behind the last.
+/// Room for pixels that are closed together, with a row more and the lanes that are stored at once
+/// behind the last.
 const MOST_CLOSING: usize = ENOUGH + EDGE + LANES;
 
 impl<S: Recorded> Default for Folded<S> {
@@ -200,13 +201,13 @@ impl<S: Recorded> Default for Folded<S> {
     }
 }
 
-/// So many of the same.
+/// Returns `N` copies of `one` on the heap.
 fn boxed<T: Copy, const N: usize>(one: T) -> Box<[T; N]> {
     vec![one; N].into_boxed_slice().try_into().unwrap_or_else(|_| unreachable!("as many"))
 }
 
 impl<S: Recorded> Folded<S> {
-    /// Where they are, row by row.
+    /// Returns the places of the pixels, row by row.
     #[inline(always)]
     pub(crate) fn places(&self) -> &Places {
         &self.places

@@ -276,7 +276,7 @@ unsafe fn apart<const GROUPS: usize, W: Wide<S>, S: Recorded, const N: usize>(
     }
 }
 
-/// What sections are added to: registers of all sheets, so many each, and in how many chunks.
+/// Target of sections: registers of all sheets, how many each, and in how many chunks.
 struct To {
     lines: *mut Line,
     sheet: usize,

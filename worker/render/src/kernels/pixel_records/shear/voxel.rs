@@ -10,7 +10,7 @@ use crate::primitives::sizes::PART;
 use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
 use std::arch::x86_64::*;
 
-/// What is added, where and by which weights.
+/// Sums, places and weights of one call.
 pub(super) type At<'a, S, const N: usize> = (
     &'a mut [Record<S, N>],
     (&'a Apart, &'a [<S as Recorded>::Payload]),
@@ -34,7 +34,7 @@ pub(super) struct Voxel<'a, S: Recorded> {
     pub(super) begins: Begins,
 }
 
-/// Where voxels' weights are looked up.
+/// Tables in which voxels' weights are looked up.
 pub(super) struct Lookup<'a, S: Recorded> {
     slant: Slant<'a>,
     /// Weights across and down: around each phase's there are [`ROWS`] zeros on either side.
@@ -102,7 +102,7 @@ impl<'a, S: Recorded> Lookup<'a, S> {
         Voxel { y, high: high.min(ROWS), deep, begins }
     }
 
-    /// What lies in the table in depth from the first weight of voxel `i` on.
+    /// Returns the table in depth from the first weight of voxel `i` on.
     #[inline(always)]
     pub(super) fn deep_from(&self, apart: &Apart, i: usize) -> &'a [S::Depth] {
         &self.deep[apart.deep[i] as usize..]
@@ -144,7 +144,7 @@ impl<'a, S: Recorded> Lookup<'a, S> {
         }
     }
 
-    /// Where the sections of voxel `i` are along an axis, by slot.
+    /// Returns the positions of the sections of voxel `i` along an axis, by slot.
     #[inline(always)]
     unsafe fn places(&self, apart: &Apart, i: usize, axis: usize) -> __m256i {
         // SAFETY: the caller has the instructions.
@@ -226,7 +226,7 @@ unsafe fn ends(least: __m256i, greatest: __m256i, none: __m256i) -> __m256i {
     }
 }
 
-/// Where the sections of voxel `i` are along an axis, from its first sheet on.
+/// Returns the positions of the sections of voxel `i` along an axis, from its first sheet on.
 #[inline(always)]
 unsafe fn places(slant: &Slant<'_>, apart: &Apart, i: usize, axis: usize) -> __m256i {
     let aside = slant.subpixels[axis][apart.deep[i] as usize..].first_chunk::<MOST>();
@@ -287,7 +287,7 @@ unsafe fn firsts(places: __m256i, phases: &Phases) -> (__m256i, __m256i) {
     }
 }
 
-/// Where the weights of [those](firsts) begin for pixels from `lo` on.
+/// Returns the indices at which the weights of [those](firsts) begin for pixels from `lo` on.
 #[inline(always)]
 unsafe fn begins((first, phase): (__m256i, __m256i), lo: i32, phases: &Phases) -> Begins {
     let mut begins = [0; MOST];

@@ -40,7 +40,7 @@ pub fn cutoff(quality: &Quality) -> f64 {
     quality.eps * 255.0
 }
 
-/// Bound of the rounding to integers.
+/// Returns a bound, in 1/255, of the rounding to integers.
 ///
 /// Let a pixel see N sheets and a sheet gather the kernels of m voxels there. Each contribution
 /// is rounded by half a raw unit, so a sheet's optical depth tau and each of its colour sums E
@@ -100,7 +100,7 @@ pub fn quantisation(scene: &SceneSpec, view: &View, within: &TightBox) -> f64 {
     255.0 * (times * delta + fixed_point)
 }
 
-/// Bound of what f32 opacity loses by being added up, sheet after sheet.
+/// Returns a bound, in 1/255, of what f32 opacity loses by being added up, sheet after sheet.
 ///
 /// A += (1 - A) a is rounded by at most 2^-25 a sheet, half the last bit below one. An error of A
 /// shrinks with every sheet that follows, so after N sheets it is at most N 2^-25. Colour adds
@@ -285,9 +285,9 @@ impl Axis {
     }
 }
 
-/// Bound of rounded positions: half a part of a pixel across and half a phase in depth. `max_alpha`
-/// is the picture's largest opacity, where it is known. `None` for the paper's opacities, which add
-/// up to another picture.
+/// Returns a bound, in 1/255, of the error of rounded positions: half a subpixel across and half a
+/// phase in depth. `max_alpha` is the picture's largest opacity, where it is known. `None` for the
+/// paper's opacities, which add up to another picture.
 ///
 /// By what is said at `Change`; sheets hold light as a field does that is constant in each. Where
 /// colours have a slope, their sums and those of the sheets beside have a part in it: a share s of
@@ -337,8 +337,9 @@ pub fn rounding(
     Some(change.bound(moved, share, sheet))
 }
 
-/// Bound of the kernel's cut: against a picture with whole Gaussians, in the limit of thin sheets.
-/// Zero for splines, of which nothing is cut.
+/// Returns a bound, in 1/255, of the error by the kernel's cut, against a picture with whole
+/// Gaussians, in the limit of thin sheets. Zero for splines, of which nothing is cut; `None` for
+/// the paper's opacities.
 ///
 /// By what is said at `Change`. The largest of all pictures' differences, 255, is what it comes to
 /// wherever solid matter may lie just beyond a ray's reach all along it.

@@ -298,7 +298,7 @@ pub struct ValueSummary {
 }
 
 impl ValueSummary {
-    /// Counts `samples`, whose values are `map` of their codes.
+    /// Returns the range, the histogram and the counts of `samples`; `map` turns codes into values.
     pub fn from_samples(samples: &Samples, map: ValueMap) -> Self {
         let mut s = ValueSummary {
             kind: samples.kind(),

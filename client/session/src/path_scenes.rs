@@ -108,7 +108,7 @@ impl PathScenes {
         Ok(PathScenes { request: request.clone(), orientation, base, tween, shared, bricks })
     }
 
-    /// Returns the scene of the `i`-th wanted frame, sums decided.
+    /// Returns the scene of the `i`-th wanted frame, with the number type of its sums decided.
     pub fn spec(&self, i: usize) -> SceneSpec {
         let Some(tween) = &self.tween else { return self.base.clone() };
         let at = (self.request.path.first_frame() + i) as f64;

@@ -81,7 +81,7 @@ impl Tween {
         Ok(())
     }
 
-    /// Returns the function of a frame.
+    /// Returns the transfer function at `frame`, counted on the whole path; need not be whole.
     pub fn transfer_at(&self, frame: f64) -> TransferFunction {
         let after = self.keys.partition_point(|k| k.0 <= frame);
         let Some(i) = after.checked_sub(1) else { return self.keys[0].1.clone() };

@@ -13,10 +13,12 @@
 //! |--|--|
 //! | `{"record":{..}}` | first: version of this format, of the program, the scheduler's settings |
 //! | `{"bricks":{..}}` | a brick set, before its first frame |
-//! | `{"scene":{..}}` | a scene as workers get it (`proto`, in hexadecimal), before its first frame |
-//! | `{"event":{"t":[..],"e":{..}}}` | an event; `t` are the readings of the clock in microseconds, the first in full, the others as differences |
+//! | `{"scene":{..}}` | a scene as workers get it (`proto`, hexadecimal), before its first frame |
+//! | `{"event":{"t":[..],"e":{..}}}` | an event, and the readings of the clock in microseconds |
 //! | `{"out":[..]}` | the decisions since the line before, as text |
 //! | `{"end":{..}}` | last: how many of both; `cut` where the file could not keep up |
+//!
+//! The first reading of the clock in `t` is in full, the others are differences.
 //!
 //! **Pixels are not stored.** The scheduler looks at two properties of a result's planes: whether
 //! they have the tile's size and are finite, and which pixels are shut. So the record keeps their

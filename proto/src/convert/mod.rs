@@ -8,12 +8,13 @@
 //! lease's size ([`check_result`]), that a view's depths fit its volume ([`check_view`]), that ids
 //! are known.
 //!
-//! | stream | up | down |
-//! |--|--|--|
-//! | Control | [`from_worker_to_wire`], [`from_worker_from_wire`] | [`to_worker_to_wire`], [`to_worker_from_wire`] |
-//! | Bricks | [`bricks_open_to_wire`], [`bricks_open_from_wire`] | [`BrickBatches`], [`Down::Bricks`], [`bricks_from_wire`] |
-//! | WatchFrames | - | [`frame_to_wire`], [`notice_to_wire`], [`watch_from_wire`] |
-//! | other calls of clients | [`submit_to_wire`], [`submit_from_wire`] | `job_...`, `volume_...`, `worker_...` |
+//! - **Control**, up: [`from_worker_to_wire`], [`from_worker_from_wire`]; down:
+//!   [`to_worker_to_wire`], [`to_worker_from_wire`].
+//! - **Bricks**, up: [`bricks_open_to_wire`], [`bricks_open_from_wire`]; down: [`BrickBatches`],
+//!   [`Down::Bricks`], [`bricks_from_wire`].
+//! - **WatchFrames**, down: [`frame_to_wire`], [`notice_to_wire`], [`watch_from_wire`].
+//! - Other calls of clients, up: [`submit_to_wire`], [`submit_from_wire`]; down: `job_...`,
+//!   `volume_...`, `worker_...`.
 
 mod cluster;
 mod error;

@@ -50,7 +50,7 @@ pub enum Lines {
 }
 
 impl Lines {
-    /// Opens what a flag names.
+    /// Opens the file, pipe or device that a flag names for lines; none without a `path`.
     ///
     /// # Errors
     /// The file can't be made or is one of the inputs.

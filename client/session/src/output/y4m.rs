@@ -5,7 +5,9 @@
 //!
 //! ```text
 //! Y' = 0.2126 R' + 0.7152 G' + 0.0722 B'
-//! y  = 16 + 219 Y'          cb = 128 + 224 (B' - Y') / 1.8556          cr = 128 + 224 (R' - Y') / 1.5748
+//! y  = 16 + 219 Y'
+//! cb = 128 + 224 (B' - Y') / 1.8556
+//! cr = 128 + 224 (R' - Y') / 1.5748
 //! ```
 //!
 //! each rounded to nearest. 4:4:4, because what is thrown away here nobody gets back, and one

@@ -5,7 +5,7 @@
 //! | [`ortho`] | orthographic; all sections of a voxel share one footprint | whole numbers |
 //! | [`sheared`] | orthographic; the kernel leans, since the lattice is not cubic | whole numbers |
 //! | [`perspective`] | perspective | whole numbers |
-//! | [`shared_rows`] | level camera: layers of the lattice are rows of the picture | whole numbers |
+//! | [`shared_rows`] | level camera: lattice layers are rows of the picture | whole numbers |
 //! | [`general`] | all | all |
 //!
 //! Each fast path says which views it accepts (`ortho::accepts`); `crate::tile` takes the first

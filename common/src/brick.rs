@@ -33,7 +33,7 @@ impl BrickGrid {
         self.dims.iter().map(|&n| n as usize).product()
     }
 
-    /// Returns whether there is no brick.
+    /// Returns whether the grid has no brick.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -67,7 +67,7 @@ impl TightBox {
         TightBox { lo: [0; 3], hi: dims.map(|n| n.saturating_sub(1)) }
     }
 
-    /// Returns the smallest box around both.
+    /// Returns the smallest box around both boxes.
     #[must_use]
     pub fn union(self, other: TightBox) -> TightBox {
         TightBox {
@@ -204,7 +204,7 @@ impl Brick {
         TightBox { lo: at(0), hi: at(1) }
     }
 
-    /// Returns the bytes that the brick takes in memory, the overhead of its buffers included.
+    /// Returns the bytes that the brick takes in memory, its own struct included.
     pub fn memory_bytes(&self) -> usize {
         let n = self.len();
         std::mem::size_of::<Brick>()

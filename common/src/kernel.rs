@@ -272,7 +272,7 @@ impl Lean {
         radius + DVec3::new(x + self.row.abs() * radius.y, y, 0.0)
     }
 
-    /// Returns [`Lean::row`] in units of 2^-16.
+    /// Returns the slope [`Lean::row`] (vox per vox) in units of 2^-16, rounded.
     pub fn row_fixed(&self) -> i64 {
         // Lattices' steps differ by a factor of a million at most.
         libm::floor(self.row * 65536.0 + 0.5).clamp(-1e12, 1e12) as i64

@@ -306,7 +306,7 @@ pub struct ErrorsBySource {
 }
 
 impl ErrorsBySource {
-    /// Returns the sources in the order of the fields.
+    /// Returns the errors by thickness, positions, truncation and ripple, in this order.
     pub fn to_array(self) -> [SampledError; 4] {
         [self.thickness, self.positions, self.truncation, self.ripple]
     }

@@ -21,7 +21,8 @@ pub struct Rect {
 }
 
 impl Rect {
-    /// Returns `[x0, x1) x [y0, y1)`.
+    /// Returns the rectangle of columns `x0` up to but without `x1` and rows `y0` up to but without
+    /// `y1`, in pixels.
     pub fn new(x0: i32, y0: i32, x1: i32, y1: i32) -> Self {
         Rect { x0, y0, x1, y1 }
     }

@@ -163,7 +163,7 @@ impl Quality {
         self.compositing != Compositing::Paper && self.kernel != Kernel::Tent && even
     }
 
-    /// Checks all ranges.
+    /// Checks that every number of the quality is in its range.
     ///
     /// # Errors
     /// Names the first field that is out of range, has no meaning beside the kernel, or is not
@@ -280,7 +280,7 @@ impl Default for Work {
 }
 
 impl Work {
-    /// Checks all ranges.
+    /// Checks that every number of the work is in its range.
     ///
     /// # Errors
     /// Names the first field that is out of range.

@@ -115,12 +115,12 @@ impl TransferFunction {
         Ok(tf)
     }
 
-    /// Returns the function as JSON (docs/design/contracts.md).
+    /// Returns the transfer function as JSON (docs/design/contracts.md).
     pub fn to_json(&self) -> String {
         serde_json::to_string(self).expect("numbers and strings can be written")
     }
 
-    /// Checks every number.
+    /// Checks every number of the transfer function, and that its points ascend.
     ///
     /// # Errors
     /// Names the field that is out of range or unsorted.

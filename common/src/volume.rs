@@ -36,7 +36,7 @@ impl Lattice {
         self.dims.iter().map(|&n| n as usize).product()
     }
 
-    /// Returns whether there is no sample.
+    /// Returns whether the lattice has no sample.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -195,7 +195,7 @@ impl Samples {
         }
     }
 
-    /// Returns whether there is no sample.
+    /// Returns whether there are no samples.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -211,7 +211,7 @@ impl Samples {
         }
     }
 
-    /// Returns the type of the samples.
+    /// Returns the number type of the samples.
     pub fn kind(&self) -> SampleKind {
         match self {
             Samples::U8(_) => SampleKind::U8,
@@ -220,7 +220,7 @@ impl Samples {
         }
     }
 
-    /// Returns an empty list of `kind`.
+    /// Returns an empty list of samples of type `kind`.
     pub fn empty(kind: SampleKind) -> Self {
         match kind {
             SampleKind::U8 => Samples::U8(Vec::new()),
@@ -229,7 +229,7 @@ impl Samples {
         }
     }
 
-    /// Returns sample `i` as a code.
+    /// Returns the code of sample number `i`, as f64.
     ///
     /// # Panics
     /// If there is no sample `i`.
@@ -242,7 +242,7 @@ impl Samples {
         }
     }
 
-    /// Appends sample `i` of `from`.
+    /// Appends sample number `i` of the list `from`.
     ///
     /// # Panics
     /// If `from` has another type or no sample `i`.
@@ -270,7 +270,7 @@ impl ValueMap {
     /// The map of files whose codes are their values.
     pub const IDENTITY: ValueMap = ValueMap { scale: 1.0, offset: 0.0 };
 
-    /// Returns the value of a code.
+    /// Returns the value, in the file's units, that a sample code stands for.
     #[inline]
     pub fn value(&self, code: f64) -> f64 {
         self.offset + self.scale * code

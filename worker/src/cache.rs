@@ -77,7 +77,7 @@ impl BrickCache {
         self.sets.values().map(BTreeMap::len).sum()
     }
 
-    /// Returns whether there is no brick.
+    /// Returns whether the cache holds no brick.
     pub fn is_empty(&self) -> bool {
         self.sets.is_empty()
     }

@@ -45,7 +45,7 @@ pub struct Bricks {
 }
 
 impl Bricks {
-    /// Returns all bricks of a store.
+    /// Returns all bricks of a store with their directory.
     pub fn from_store(store: &BrickStore) -> Bricks {
         let brick = |i: &BrickInfo| store.brick(i.id).expect("a brick that the store knows");
         let all = store.infos().iter().map(brick).collect();

@@ -146,7 +146,7 @@ impl Cluster {
     }
 }
 
-/// Starts a master.
+/// Starts a master in this process, without workers.
 ///
 /// # Errors
 /// The system gives no threads.

@@ -65,7 +65,7 @@ pub fn time(text: &str) -> Result<f64, String> {
     if ms > 0.0 && ms.is_finite() { Ok(ms) } else { Err(bad()) }
 }
 
-/// Parses `WxH` into pixels.
+/// Parses a width and height in pixels, `WxH`.
 ///
 /// # Errors
 /// A line for the user that says what the flag takes, if `text` is anything else.
@@ -407,7 +407,7 @@ pub enum Frames {
     Range([u32; 2]),
 }
 
-/// Parses `18` or `30..60`.
+/// Parses a number of frames, `18`, or the first and last one, `30..60`.
 ///
 /// # Errors
 /// A line for the user that says what the flag takes, if `text` is anything else.

@@ -86,7 +86,7 @@ impl Transfer {
         Ok(Transfer { base, file, title, preset: None, colours, light, shading, nan })
     }
 
-    /// Returns a preset unchanged by flags.
+    /// Returns the preset or colour map called `name`, unchanged by flags.
     ///
     /// # Errors
     /// No preset or colour map has that name.

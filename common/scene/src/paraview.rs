@@ -152,7 +152,7 @@ pub fn parse(text: &str) -> Result<ColourMap, InvalidField> {
 }
 
 impl ColourMap {
-    /// Returns the whole transfer function.
+    /// Returns the colour map and its opacities as one transfer function.
     ///
     /// # Errors
     /// If the file has no opacities.

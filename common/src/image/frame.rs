@@ -50,7 +50,7 @@ impl FrameState {
         self.size[0] as usize * self.size[1] as usize
     }
 
-    /// Returns width and height in pixels.
+    /// Returns width and height of the picture in pixels.
     pub fn size(&self) -> [u32; 2] {
         self.size
     }
@@ -137,7 +137,7 @@ impl FrameState {
         self.sums_tiles.push((tile, pixels));
     }
 
-    /// Adds a tile that came encoded.
+    /// Adds a tile whose pixels its worker encoded.
     ///
     /// # Panics
     /// If its parts don't fit each other ([`SparseTile::check`]) or the tile, or the tile leaves

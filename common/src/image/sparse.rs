@@ -187,7 +187,7 @@ impl FrameAssembler {
         FrameAssembler { format: finish.format, width, picture }
     }
 
-    /// Places tiles at their rectangles.
+    /// Places tiles at their rectangles in the picture.
     ///
     /// # Panics
     /// If a tile has another format, its parts don't fit each other, or it leaves the picture.

@@ -196,7 +196,7 @@ impl RegionProgress {
         }
     }
 
-    /// Returns whether all parts are drawn.
+    /// Returns whether all parts of the tile are drawn.
     pub fn is_done(&self) -> bool {
         self.parts.iter().all(|p| p.done_ns >= p.total_ns)
     }

@@ -497,7 +497,7 @@ impl Scheduler {
         }
     }
 
-    /// Returns the next action, if any.
+    /// Returns the next action for the driver to carry out; `None` if there is none.
     pub fn next_action(&mut self) -> Option<Action> {
         self.cluster.out.pop_front()
     }
@@ -507,7 +507,7 @@ impl Scheduler {
         if self.prefetch_is_due() { Some(0) } else { self.deadline() }
     }
 
-    /// Whether the next [`Event::Tick`] prefetches bricks of a frame.
+    /// Returns whether the next [`Event::Tick`] prefetches bricks of a frame.
     pub fn prefetch_is_due(&self) -> bool {
         self.active.iter().filter_map(Frame::as_region).any(|f| f.has_prefetch())
     }
@@ -545,7 +545,7 @@ impl Scheduler {
         self.cluster.roster.in_reserve()
     }
 
-    /// Returns counters over the scheduler's lifetime.
+    /// Returns the counters of mishaps over the scheduler's lifetime.
     pub fn totals(&self) -> Totals {
         self.cluster.totals
     }

@@ -229,7 +229,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         self.handed_over
     }
 
-    /// Returns the jobs of all frames.
+    /// Returns the jobs of all frames that were queued.
     pub fn jobs(&self) -> impl Iterator<Item = &FrameJob> {
         self.frames.values().map(|f| &*f.job)
     }

@@ -5,7 +5,7 @@
 pub struct Rng(u64);
 
 impl Rng {
-    /// Returns the generator of a seed.
+    /// Returns a generator whose numbers `seed` determines.
     pub fn new(seed: u64) -> Self {
         let mut rng = Rng((seed ^ 0x9e37_79b9_7f4a_7c15).wrapping_mul(0x2545_f491_4f6c_dd1d) | 1);
         for _ in 0..8 {
@@ -34,12 +34,12 @@ impl Rng {
         lo + self.below(hi - lo + 1)
     }
 
-    /// Returns true once in `n` times.
+    /// Returns true once in `n` times, at random; always for 0 and 1.
     pub fn one_in(&mut self, n: u64) -> bool {
         self.below(n) == 0
     }
 
-    /// Returns one of some values.
+    /// Returns one of `values`, at random.
     ///
     /// # Panics
     /// If there are none.

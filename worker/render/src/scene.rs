@@ -42,7 +42,7 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// Prepares the scene that `spec` describes.
+    /// Prepares the scene that `spec` describes: tables of appearance and light.
     pub fn new(spec: &SceneSpec) -> Self {
         let classifier = Classifier::new(&spec.transfer, &spec.volume, spec.quality.compositing);
         let payload_max = classifier.payload_max();
@@ -263,7 +263,7 @@ impl Frame {
         &self.offsets
     }
 
-    /// Returns the position of brick `id`.
+    /// Returns the position of the first voxel of brick `id`.
     pub fn corner(&self, id: BrickId) -> Corner {
         let index = self.scene.grid.corner(id);
         let eye = self.view.corner_in_eye(index);

@@ -98,7 +98,7 @@ impl Provenance {
         request
     }
 
-    /// Returns what lies behind transparent pixels.
+    /// Returns the background that the volume is composited over.
     pub fn background(&self) -> Background {
         match self.background {
             Ground::Word(_) => Background::Transparent,
@@ -173,7 +173,7 @@ impl Provenance {
     }
 }
 
-/// Reads a picture's file.
+/// Reads the bytes of a picture's file.
 ///
 /// # Errors
 /// The file can't be read or is larger than any picture.

@@ -376,7 +376,7 @@ pub struct WorkArgs {
 }
 
 impl WorkArgs {
-    /// Returns how the work is cut.
+    /// Returns the schedule and the cut of the work that the flags ask for.
     ///
     /// # Errors
     /// A value is out of its range; the error names the flag.

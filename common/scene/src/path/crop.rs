@@ -35,7 +35,7 @@ pub struct Crop {
 }
 
 impl Crop {
-    /// Checks what needs no lattice.
+    /// Checks the ends of the box as far as that needs no lattice.
     ///
     /// # Errors
     /// Names the axis whose ends are not finite or not ascending.

@@ -44,7 +44,7 @@ pub struct FlyThrough {
 }
 
 impl FlyThrough {
-    /// Checks counts and numbers.
+    /// Checks the numbers of frames and points, and every coordinate.
     ///
     /// # Errors
     /// Names the field, or the point that is not finite or equals the one before.

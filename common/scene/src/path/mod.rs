@@ -339,7 +339,7 @@ impl ViewPath {
         counts.into_iter().flatten().next().map_or(self.views.len(), |n| n as usize)
     }
 
-    /// Returns the number of wanted frames.
+    /// Returns the number of frames that are wanted of the path.
     pub fn frames(&self) -> usize {
         self.range.map_or(self.all_frames(), |[first, last]| (last - first) as usize + 1)
     }

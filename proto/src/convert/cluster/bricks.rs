@@ -121,7 +121,7 @@ pub struct BrickBatches<I> {
 }
 
 impl<I: Iterator<Item = Bytes>> BrickBatches<I> {
-    /// Starts with the first of `bricks`.
+    /// Makes batches of the encoded `bricks` of `set`, in their order.
     pub fn new(set: &BrickSetKey, bricks: impl IntoIterator<IntoIter = I>) -> Self {
         BrickBatches { set: key_to_wire(set), bricks: bricks.into_iter(), next: None }
     }

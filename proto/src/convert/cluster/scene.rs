@@ -73,7 +73,7 @@ pub fn scene_to_wire(scene: &SceneSpec) -> wire::Scene {
     }
 }
 
-/// Reads a scene.
+/// Converts a scene from its message on the wire.
 ///
 /// # Errors
 /// [`WireError`] names the field that is wrong.
@@ -176,7 +176,7 @@ pub fn check_view(lattice: &Lattice, view: &View) -> Result<(), WireError> {
     }
 }
 
-/// Reads a view.
+/// Converts a view from its message on the wire.
 ///
 /// # Errors
 /// [`WireError`] names the field that is wrong.

@@ -101,7 +101,7 @@ pub fn job_to_wire(job: &Job) -> wire::Job {
     }
 }
 
-/// Reads a job.
+/// Converts a job from the message that clients get.
 ///
 /// # Errors
 /// [`WireError`] names the field that is wrong.
@@ -139,7 +139,7 @@ pub fn worker_to_wire(worker: &Worker) -> wire::Worker {
     }
 }
 
-/// Reads a worker.
+/// Converts a worker from the message that clients get.
 ///
 /// # Errors
 /// [`WireError`] names the field that is wrong.

@@ -37,7 +37,7 @@ pub struct StatisticsParts {
 }
 
 impl StatisticsParts {
-    /// Appends the next part.
+    /// Appends the next part of the statistics.
     ///
     /// # Errors
     /// [`WireError`] if there are more entries than any frame has.
@@ -60,7 +60,7 @@ impl StatisticsParts {
         Ok(())
     }
 
-    /// Returns the statistics.
+    /// Returns the frame's statistics, put together from all parts.
     ///
     /// # Errors
     /// [`WireError`] if none came, or names the field that is wrong.

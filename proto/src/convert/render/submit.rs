@@ -48,7 +48,7 @@ pub fn submit_to_wire(request: &PathRequest) -> wire::SubmitPathRequest {
     }
 }
 
-/// Reads a request for a path.
+/// Converts a client's request for a path from its message.
 ///
 /// # Errors
 /// [`WireError`] names the field that is wrong. Whether the cameras can be drawn only the volume's

@@ -10,7 +10,7 @@ use glam::DVec3;
 use slabcast_common::volume::{Lattice, VolumeInfo};
 use slabcast_scene::path::Orientation;
 
-/// Writes the volume of a master.
+/// Converts the volume of a master to the message that clients get.
 pub fn volume_to_wire(volume: &VolumeDescription) -> wire::DescribeVolumeResponse {
     wire::DescribeVolumeResponse {
         name: volume.name.clone(),
@@ -25,7 +25,7 @@ pub fn volume_to_wire(volume: &VolumeDescription) -> wire::DescribeVolumeRespons
     }
 }
 
-/// Reads the volume of a master.
+/// Converts the volume of a master from the message that clients get.
 ///
 /// # Errors
 /// [`WireError`] names the field that is wrong.

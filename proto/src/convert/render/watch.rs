@@ -94,7 +94,7 @@ fn message(message: wire::watch_frames_response::Message) -> wire::WatchFramesRe
     wire::WatchFramesResponse { message: Some(message) }
 }
 
-/// Reads one message of a watch.
+/// Converts one message of `WatchFrames`: a piece of a frame, or a notice.
 ///
 /// # Errors
 /// [`WireError`] names the field that is wrong.

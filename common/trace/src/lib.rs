@@ -189,11 +189,12 @@ pub struct RegionTile {
     /// Numbers of the blocks whose bricks the tile looks at, ascending; blocks are numbered front
     /// to back.
     pub opened: Vec<u32>,
-    /// When drawing comes to each of `touched`, in thousandths of `ns`. Only tiles of one part have
-    /// it; larger tiles take it from their parts. Empty: all bricks are needed at once.
+    /// Moment at which drawing comes to each brick of `touched`, in thousandths of the tile's
+    /// drawing time. Only tiles of one part have moments; larger tiles take them from their parts.
+    /// Empty: all bricks are needed at once.
     pub needed: Vec<u16>,
-    /// Places of the bricks that a worker without any would prefetch for it, judging by the frame
-    /// before; ascending.
+    /// Places of the bricks that a worker without any would prefetch for the tile, judging by the
+    /// frame before; ascending.
     pub expected: Vec<u32>,
 }
 

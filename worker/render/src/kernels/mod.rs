@@ -356,7 +356,7 @@ fn bounded(x: f32, most: f32) -> f32 {
     if x < most { x } else { most }
 }
 
-/// Returns the whole number below `x`, 0 to 2^31; 0 for negative numbers and NaN.
+/// Rounds `x` down to a whole number, 0 to 2^31; negative numbers and NaN become 0.
 #[inline(always)]
 pub fn truncate(x: f32) -> u32 {
     let bounded = bounded(x, LARGEST);

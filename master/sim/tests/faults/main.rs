@@ -138,17 +138,17 @@ fn chaos(seed: u64, schedules: Schedules) -> World {
 
 #[test]
 fn chaos_under_the_slab_schedule_leaves_serial_pictures() {
-    campaign(SLAB, seeds(300));
+    campaign(SLAB, seeds(150));
 }
 
 #[test]
 fn chaos_under_the_region_schedule_leaves_serial_pictures() {
-    campaign(REGION, seeds(300));
+    campaign(REGION, seeds(150));
 }
 
 #[test]
 fn chaos_under_mixed_schedules_leaves_serial_pictures() {
-    campaign(MIXED, seeds(150));
+    campaign(MIXED, seeds(100));
 }
 
 /// A world whose frames come one by one, of one set and one size. Each is the only one in flight,
@@ -209,7 +209,7 @@ fn chaos_alone(seed: u64) -> World {
 
 #[test]
 fn chaos_with_sole_frames_and_work_stealing_leaves_serial_pictures() {
-    let range = seeds(150);
+    let range = seeds(80);
     let one = range.end - range.start == 1;
     let (mut frames, mut cut, mut mixed, mut lost, mut dropped, mut retries) = (0, 0, 0, 0, 0, 0);
     let mut pieces = 0;
@@ -287,7 +287,7 @@ fn chaos_crowd(seed: u64) -> (World, usize) {
 
 #[test]
 fn chaos_with_a_small_active_set_leaves_serial_pictures() {
-    let range = seeds(100);
+    let range = seeds(60);
     let one = range.end - range.start == 1;
     let (mut frames, mut held, mut worlds, mut lost, mut retries) = (0, 0, 0, 0, 0);
     for seed in range {

@@ -391,7 +391,8 @@ impl Simd {
         Simd(Level::Plain)
     }
 
-    /// Returns all instruction sets that this machine has, the plain one first.
+    /// Returns all instruction sets that this machine has and this build was compiled for, the
+    /// plain one first. Debug builds made on a machine with AVX-512 have no AVX2 (`build.rs`).
     pub fn all() -> Vec<Self> {
         #[allow(unused_mut, reason = "grows on x86-64 and 64-bit ARM only")]
         let mut all = vec![Simd(Level::Plain)];
@@ -407,7 +408,7 @@ impl Simd {
                 && is_x86_feature_detected!("lzcnt")
                 && is_x86_feature_detected!("bmi1")
                 && is_x86_feature_detected!("bmi2");
-            if is_x86_feature_detected!("avx2") && counts_bits {
+            if cfg!(all_levels) && is_x86_feature_detected!("avx2") && counts_bits {
                 all.push(Simd(Level::Avx2));
             }
             if counts_bits
@@ -462,8 +463,10 @@ impl Simd {
     pub fn run<W: Work>(self, work: W) -> W::Out {
         match self.0 {
             // SAFETY: the value proves that the instructions are there (`Simd::all`).
-            #[cfg(target_arch = "x86_64")]
+            #[cfg(all(target_arch = "x86_64", all_levels))]
             Level::Avx2 => unsafe { run_avx2(work) },
+            #[cfg(all(target_arch = "x86_64", not(all_levels)))]
+            Level::Avx2 => unreachable!("`Simd::all` leaves it out"),
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe { run_avx512(work) },
@@ -488,7 +491,7 @@ fn run_neon<W: Work>(work: W) -> W::Out {
     work.run(Simd(Level::Neon))
 }
 
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", all_levels))]
 #[inline(never)]
 #[target_feature(enable = "avx2,popcnt,lzcnt,bmi1,bmi2")]
 fn run_avx2<W: Work>(work: W) -> W::Out {

@@ -646,7 +646,7 @@ fn model_error_bounds_hold_on_every_pixel() {
             ] {
                 let tf = alpha(colors.clone(), vec![[0.0, 0.0], [40.0, opacity]]);
                 let quality = Quality { thickness, compositing, ..i32_sums() };
-                let n = 29;
+                let n = 21;
                 let asked = JudgedScene::new(volume.clone(), tf, quality, camera, n);
                 let reference = asked.reference();
                 let whole = asked.reference().without_truncation();

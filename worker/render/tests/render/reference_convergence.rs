@@ -61,9 +61,9 @@ fn thin_sheets_converge_to_the_reference_in_both_projections() {
     for projection in projections(n) {
         let q = Quality { thickness: 1.0 / 16.0, ..i32_sums() };
         let asked = JudgedScene::new(balls(n), lit(), q, oblique(projection), 96);
-        let figures = figures(&asked, 1024, limit);
+        let figures = figures(&asked, 512, limit);
         println!("{projection:?}: {figures:?}");
-        assert!(figures.n_pixels > 200);
+        assert!(figures.n_pixels > 150);
         assert!(figures.rmse < 0.05, "{projection:?}: {figures:?}");
     }
 }
@@ -76,9 +76,9 @@ fn thin_sheets_of_sheared_kernels_converge_to_the_reference() {
         volume.lattice = lattice;
         let q = Quality { thickness: 1.0 / 16.0, ..i32_sums() };
         let asked = JudgedScene::new(volume, lit(), q, oblique(projection), 72);
-        let figures = figures(&asked, 600, limit);
+        let figures = figures(&asked, 400, limit);
         println!("{projection:?}: {figures:?}");
-        assert!(figures.n_pixels > 200);
+        assert!(figures.n_pixels > 150);
         assert!(figures.rmse < 0.05, "{projection:?}: {figures:?}");
     }
 }
@@ -95,7 +95,7 @@ fn sheared_kernel_sheets_match_the_same_sheets_in_f64() {
             volume.lattice = lattice;
             let q = Quality { thickness, ..i32_sums() };
             let asked = JudgedScene::new(volume, lit(), q, oblique(projection), 64);
-            let figures = figures(&asked, 512, same_sheets);
+            let figures = figures(&asked, 256, same_sheets);
             println!("{:?} {projection:?} {thickness}: {figures:?}", lattice.steps);
             let most = if thickness <= 1.0 { 0.05 } else { 0.8 };
             assert!(figures.rmse < most, "{projection:?} {thickness}: {figures:?}");
@@ -179,9 +179,5 @@ fn exact_sections_restore_the_convergence_order_in_perspective() {
     println!("exact: linear {linear:?}, order {:?}", orders(linear));
     assert!(orders(linear).iter().all(|&o| o > 3.0), "{linear:?}");
     let [middle, _] = errors(persp, SectionPlacement::MidPlane);
-    for section in [SectionPlacement::Centroid, SectionPlacement::Between] {
-        let [linear, _] = errors(persp, section);
-        println!("{section:?}: linear {linear:?}, order {:?}", orders(linear));
-    }
     assert!(10.0 * linear[3] < middle[3], "{linear:?} {middle:?}");
 }

@@ -159,7 +159,7 @@ fn what_deciding_takes() {
     const FRAMES: usize = 48;
     let (jobs, trace) = ball(FRAMES);
     println!("{} bricks; the least of 5 runs", jobs[0].bricks.len());
-    for (workers, in_flight) in [(15, 1), (15, 4), (64, 1), (64, 4)] {
+    for (workers, in_flight) in [(1, 4), (8, 4), (15, 1), (15, 4), (64, 1), (64, 4)] {
         let cluster = Cluster {
             workers,
             threads: 1,

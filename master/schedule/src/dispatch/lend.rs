@@ -88,16 +88,16 @@ impl FrameCore {
         among: impl Fn(u32) -> bool,
         suits: impl Fn(u32) -> bool,
     ) -> Option<u32> {
-        let mine = self.table.places(id);
+        let mine = || self.table.places(id).collect();
         let others = |task: &Task| another_could_have(cluster, task, id);
-        self.table.queue.next_for(id, &mine, among, others, suits)
+        self.table.queue.next_for(id, mine, among, others, suits)
     }
 
     /// Returns the first waiting task among a worker's own that it may have.
     fn next_own(&self, cluster: &Cluster, id: WorkerId, own: &[u32]) -> Option<u32> {
-        let mine = self.table.places(id);
+        let mine = || self.table.places(id).collect();
         let others = |task: &Task| another_could_have(cluster, task, id);
-        self.table.queue.next_among(id, &mine, own, others)
+        self.table.queue.next_among(id, mine, own, others)
     }
 
     /// Sends a worker the scene and the view of the frame, if it was not sent them.
@@ -349,7 +349,7 @@ impl RegionFrame {
     /// any is unknown.
     pub(crate) fn lent_us(&self, id: WorkerId) -> f64 {
         let places = self.core.table.places(id);
-        places.into_iter().map(|place| self.tiles.us(place).unwrap_or(f64::INFINITY)).sum()
+        places.map(|place| self.tiles.us(place).unwrap_or(f64::INFINITY)).sum()
     }
 
     /// Lends each worker tasks that are its own, or whose owner is missing.

@@ -346,11 +346,9 @@ impl RegionFrame {
     /// Time that the bricks of a piece take on the link: half of those of its tile overlap it.
     fn piece_bricks_us(&self, cluster: &Cluster, place: u32) -> f64 {
         let history = cluster.history.view(self.key);
-        let cost = history.and_then(|h| h.cost(&self.core.table.tile(place)));
-        let job = &self.core.job;
-        let bytes: u64 = job.bricks.iter().map(|b| u64::from(b.bytes)).sum();
-        let brick = bytes as f64 / job.bricks.len().max(1) as f64;
-        0.5 * self.costs.byte_us * brick * cost.map_or(0, |c| c.bricks) as f64
+        let bricks = history.map_or(0, |h| h.bricks(&self.core.table.tile(place)));
+        let bytes = bricks as f64 * cluster.residency.brick_bytes(self.core.job.scene.bricks);
+        0.5 * self.costs.byte_us * bytes
     }
 
     /// Sends the questions; the leases have left.

@@ -5,7 +5,7 @@
 //! stays with the owner of the frame before, which holds its bricks, unless the frame is predicted
 //! to end earlier otherwise by more than its bricks cost ([`rebalance`]).
 
-use super::cost_history::{TileCost, WorkerRates};
+use super::cost_history::{TileCost, WorkerRates, believed_ratio};
 use super::cost_model::SWITCH_GAIN_RATIO;
 use super::macrotile::Macrotile;
 use super::makespan::rebalance;
@@ -43,6 +43,11 @@ impl Group {
         self.threads.iter().sum::<f64>() as u64
     }
 
+    /// Whether there is more than one worker.
+    pub(crate) fn has_several(&self) -> bool {
+        self.ids.len() > 1
+    }
+
     /// Returns the index of a worker. One in reserve is replaced by its neighbour.
     fn index_of(&self, id: WorkerId, roster: &Roster) -> Option<usize> {
         match self.ids.binary_search(&id) {
@@ -67,11 +72,8 @@ impl Group {
         if self.ids.is_empty() {
             return vec![WorkerId(0); tiles.len()];
         }
-        let cost = |i: usize, w: usize| {
-            let tile = &tiles[i];
-            let ratio = tile.cost.map_or(1.0, |c| rates.ratio(self.ids[w], c.owner));
-            tile.us * ratio / self.threads[w]
-        };
+        let times = Times::new(self, tiles, rates);
+        let cost = |i: usize, w: usize| times.us(i, w);
         let mut held: Vec<Option<usize>> =
             tiles.iter().map(|t| self.index_of(t.owner?, roster)).collect();
         // In the order of rows.
@@ -101,11 +103,13 @@ impl Group {
             // Moves and swaps of single tiles get stuck where tiles of two sizes mix. Then all are
             // dealt anew, the longest first.
             let takes = |i: usize, w: usize| cost(i, w) + price(i, w);
-            let mut dealt = self.deal(tiles, takes);
-            rebalance(&mut dealt, self.ids.len(), slack, cost, price);
-            let (kept_us, dealt_us) = (self.end_us(&owners, takes), self.end_us(&dealt, takes));
-            if dealt_us < (1.0 - SWITCH_GAIN_RATIO) * kept_us {
-                owners = dealt;
+            let wanted_us = (1.0 - SWITCH_GAIN_RATIO) * self.end_us(&owners, takes);
+            if times.soonest_us() < wanted_us {
+                let mut dealt = self.deal(tiles, takes);
+                rebalance(&mut dealt, self.ids.len(), slack, cost, price);
+                if self.end_us(&dealt, takes) < wanted_us {
+                    owners = dealt;
+                }
             }
         }
         owners.into_iter().map(|w| self.ids[w]).collect()
@@ -159,6 +163,54 @@ impl Group {
     }
 }
 
+/// Times that tiles take the workers of a group.
+struct Times<'a> {
+    tiles: &'a [TileToAssign],
+    threads: &'a [f64],
+    /// How much slower than others each worker is, and each tile's last worker. Looked up once,
+    /// since a search asks for a time thousands of times.
+    slowness: Vec<f64>,
+    last_slowness: Vec<Option<f64>>,
+    /// No worker counts as slower than another.
+    are_alike: bool,
+}
+
+impl<'a> Times<'a> {
+    fn new(group: &'a Group, tiles: &'a [TileToAssign], rates: &WorkerRates) -> Times<'a> {
+        let last = |t: &TileToAssign| t.cost.map(|c| rates.slowness(c.owner));
+        let slowness: Vec<f64> = group.ids.iter().map(|id| rates.slowness(*id)).collect();
+        let last_slowness: Vec<_> = tiles.iter().map(last).collect();
+        let all = || slowness.iter().chain(last_slowness.iter().flatten()).copied();
+        let (least, most) = (all().fold(f64::INFINITY, f64::min), all().fold(0.0, f64::max));
+        let are_alike = believed_ratio(most / least) <= 1.0;
+        Times { tiles, threads: &group.threads, slowness, last_slowness, are_alike }
+    }
+
+    /// Returns how many microseconds a worker is busy with a tile.
+    fn us(&self, tile: usize, worker: usize) -> f64 {
+        let us = self.tiles[tile].us / self.threads[worker];
+        match self.last_slowness[tile].filter(|_| !self.are_alike) {
+            Some(last) => us * believed_ratio(self.slowness[worker] / last),
+            None => us,
+        }
+    }
+
+    /// Returns a time in microseconds before which no assignment ends: all threads are as fast as
+    /// the fastest and none waits, or the longest tile alone.
+    fn soonest_us(&self) -> f64 {
+        let fastest = self.slowness.iter().copied().fold(f64::INFINITY, f64::min);
+        let threads: f64 = self.threads.iter().sum();
+        let most = self.threads.iter().copied().fold(0.0, f64::max);
+        let (mut all, mut longest) = (0.0, 0.0_f64);
+        for (tile, last) in self.tiles.iter().zip(&self.last_slowness) {
+            let us = tile.us * last.map_or(1.0, |last| believed_ratio(fastest / last));
+            all += us;
+            longest = longest.max(us);
+        }
+        (all / threads).max(longest / most)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -177,7 +229,7 @@ mod tests {
     fn assign(group: &Group, tiles: &[(Option<u64>, f64)], price_us: f64) -> Vec<u64> {
         let tile = |&(owner, us): &(Option<u64>, f64)| {
             let owner = owner.map(WorkerId);
-            let cost = owner.map(|owner| TileCost { owner, us, bricks: 0 });
+            let cost = owner.map(|owner| TileCost { owner, us });
             TileToAssign { us, cost, owner, price_us }
         };
         let tiles: Vec<_> = tiles.iter().map(tile).collect();

@@ -20,8 +20,6 @@ use slabcast_common::blocks::{Block, Blocks};
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::WorkerId;
 use slabcast_common::occlusion::Rect;
-use std::collections::BTreeSet;
-use std::sync::Arc;
 
 /// Limit: edge in pixels of the tiles that are rendered in one part
 /// (`slabcast_common::region::PART`). Smaller tiles of the same pixels take longer altogether.
@@ -60,14 +58,14 @@ pub(crate) struct WorkerRates {
 }
 
 impl WorkerRates {
-    fn slowness(&self, id: WorkerId) -> f64 {
+    /// Returns how many times longer than others a worker takes; 1 while nothing is known.
+    pub(crate) fn slowness(&self, id: WorkerId) -> f64 {
         self.slowness.get(id).copied().unwrap_or(1.0)
     }
 
     /// Returns how many times longer `one` takes than `other`; 1 within the dead band.
     pub(crate) fn ratio(&self, one: WorkerId, other: WorkerId) -> f64 {
-        let ratio = self.slowness(one) / self.slowness(other);
-        if (1.0 / RATE_DEADBAND_RATIO..=RATE_DEADBAND_RATIO).contains(&ratio) { 1.0 } else { ratio }
+        believed_ratio(self.slowness(one) / self.slowness(other))
     }
 
     /// Notes that one tile took `one` worker `one_us`, and `other` `other_us` in the frame before.
@@ -92,13 +90,20 @@ impl WorkerRates {
     }
 }
 
+/// Returns a ratio of two workers' slowness as it is believed: 1 within the dead band.
+pub(crate) fn believed_ratio(ratio: f64) -> f64 {
+    if (1.0 / RATE_DEADBAND_RATIO..=RATE_DEADBAND_RATIO).contains(&ratio) { 1.0 } else { ratio }
+}
+
 /// The last rendering of a tile.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct Rendering {
     tile: Rect,
     owner: WorkerId,
     /// Indices of the bricks it was rendered from.
-    bricks: Box<[u32]>,
+    bricks: Vec<u32>,
+    /// Number of leaves that it is the last rendering of. At 0 its place is free.
+    leaves: u32,
 }
 
 /// What is known of one leaf.
@@ -106,7 +111,8 @@ struct Rendering {
 struct LeafCost {
     /// Rendering time in microseconds, as part of a tile of [`WHOLE_PX`] pixels or more.
     us: f64,
-    last: Option<Arc<Rendering>>,
+    /// Its last rendering: an index of `ViewHistory::renderings`.
+    last: Option<u32>,
     /// Owner of the leaf's tile in the frame that was cut last, rendered or not. A worker that
     /// steals a tile does so once: in the next frame the tile goes back to where its neighbours
     /// are, lest borders, and with them bricks at two workers, become more and more.
@@ -120,8 +126,17 @@ pub(crate) struct TileCost {
     pub(crate) owner: WorkerId,
     /// Rendering time in microseconds.
     pub(crate) us: f64,
-    /// Number of bricks that come along with it to another worker.
-    pub(crate) bricks: usize,
+}
+
+/// What is known of the leaves of a picture that are to be rendered.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct KnownLeaves {
+    /// Number of leaves.
+    pub(crate) all: usize,
+    /// Number of those that were rendered before.
+    pub(crate) rendered: usize,
+    /// Time of all in microseconds, as part of tiles of [`WHOLE_PX`] pixels or more.
+    pub(crate) us: f64,
 }
 
 /// Leaves of the pictures of one kind.
@@ -130,6 +145,9 @@ pub(crate) struct ViewHistory {
     key: HistoryKey,
     columns: usize,
     leaves: Vec<LeafCost>,
+    /// Last renderings of all leaves, and the places among them that are free.
+    renderings: Vec<Rendering>,
+    free: Vec<u32>,
     /// Tile edge of the frame that was cut last, in pixels.
     pub(crate) last_edge: Option<u32>,
 }
@@ -141,6 +159,8 @@ impl ViewHistory {
             key,
             columns,
             leaves: vec![LeafCost::default(); columns * rows],
+            renderings: Vec::new(),
+            free: Vec::new(),
             last_edge: None,
         }
     }
@@ -162,41 +182,88 @@ impl ViewHistory {
         self.rows(tile).flat_map(|row| &self.leaves[row])
     }
 
+    /// Returns the rendering time of a tile in microseconds, however earlier frames were cut; `None`:
+    /// no part of it was rendered.
+    pub(crate) fn us(&self, tile: &Rect) -> Option<f64> {
+        self.cost(tile).map(|cost| cost.us)
+    }
+
+    /// Returns what is known of those leaves, row by row, that are to be rendered.
+    pub(crate) fn known_leaves(&self, to_render: impl Iterator<Item = bool>) -> KnownLeaves {
+        let mut known = KnownLeaves::default();
+        for (leaf, _) in self.leaves.iter().zip(to_render).filter(|(_, to_render)| *to_render) {
+            known.all += 1;
+            known.rendered += usize::from(leaf.last.is_some());
+            known.us += leaf.us;
+        }
+        known
+    }
+
     /// Returns what is known of a tile, however earlier frames were cut.
     pub(crate) fn cost(&self, tile: &Rect) -> Option<TileCost> {
+        let (owner, us) = self.owner_and_leaves_us(tile)?;
+        Some(TileCost { owner, us: us * time_ratio(tile) })
+    }
+
+    /// Returns the worker that rendered most of a tile, and the time of its leaves in microseconds.
+    fn owner_and_leaves_us(&self, tile: &Rect) -> Option<(WorkerId, f64)> {
         let mut us = 0.0;
-        // Few workers and renderings share a tile.
-        let mut owners: [(WorkerId, f64); 4] = [(WorkerId(0), 0.0); 4];
-        let mut count = 0;
-        let mut renderings: Vec<&Arc<Rendering>> = Vec::new();
-        for leaf in self.leaves_of(tile) {
-            let Some(rendering) = &leaf.last else { continue };
-            us += leaf.us;
-            // Leaves that take no time count too.
-            let weight = leaf.us + 1e-9;
-            match owners[..count].iter().position(|o| o.0 == rendering.owner) {
-                Some(i) => owners[i].1 += weight,
-                None if count < owners.len() => {
-                    owners[count] = (rendering.owner, weight);
-                    count += 1;
+        /// Limit: workers that share a tile; others count for nobody, in the last place.
+        const MOST: usize = 4;
+        let mut owners = [(WorkerId(0), 0.0); MOST + 1];
+        let (mut count, mut before, mut at) = (0, None, 0);
+        for row in self.rows(tile) {
+            for leaf in &self.leaves[row] {
+                let Some(last) = leaf.last else { continue };
+                us += leaf.us;
+                // Neighbouring leaves mostly share a rendering.
+                if before.replace(last) != Some(last) {
+                    let owner = self.renderings[last as usize].owner;
+                    let known = owners[..count].iter().position(|o| o.0 == owner);
+                    at = known.unwrap_or(count);
+                    if at == count && count < MOST {
+                        owners[at] = (owner, 0.0);
+                        count += 1;
+                    }
                 }
-                None => {}
-            }
-            if !renderings.iter().any(|r| Arc::ptr_eq(r, rendering)) {
-                renderings.push(rendering);
+                // Leaves that take no time count too.
+                owners[at].1 += leaf.us + 1e-9;
             }
         }
-        let bricks = match renderings[..] {
+        let most = owners[..count].iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
+        Some((most.0, us))
+    }
+
+    /// Returns the number of bricks that come along with a tile to another worker.
+    pub(crate) fn bricks(&self, tile: &Rect) -> usize {
+        let renderings = self.renderings(tile, |_| true);
+        match renderings[..] {
             // Half of the bricks of a larger tile overlap this one.
             [one] if one.tile.area() > tile.area() => one.bricks.len() / 2,
             [one] => one.bricks.len(),
-            _ => {
-                let lists = renderings.iter().flat_map(|r| r.bricks.iter());
-                lists.collect::<BTreeSet<_>>().len()
+            _ => count_distinct(renderings.iter().map(|r| &r.bricks[..])),
+        }
+    }
+
+    /// Returns the last renderings of a tile's leaves, each once, by workers for which `counts`
+    /// says so.
+    fn renderings(&self, tile: &Rect, counts: impl Fn(WorkerId) -> bool) -> Vec<&Rendering> {
+        let mut found: Vec<&Rendering> = Vec::new();
+        let mut before = None;
+        for row in self.rows(tile) {
+            for last in self.leaves[row].iter().filter_map(|leaf| leaf.last) {
+                // Neighbouring leaves mostly share one.
+                if before.replace(last) == Some(last) {
+                    continue;
+                }
+                let rendering = &self.renderings[last as usize];
+                let is_new = || !found.iter().any(|r| std::ptr::eq(*r, rendering));
+                if counts(rendering.owner) && is_new() {
+                    found.push(rendering);
+                }
             }
-        };
-        let owner = owners[..count].iter().max_by(|a, b| a.1.total_cmp(&b.1))?.0;
-        Some(TileCost { owner, us: us * time_ratio(tile), bricks })
+        }
+        found
     }
 
     /// Returns the owner of a tile in the frame that was cut last.
@@ -217,12 +284,7 @@ impl ViewHistory {
     /// Returns the bricks that other workers rendered a tile from, as lists; `true`: the list is of
     /// a larger area, of which the tile is a part.
     pub(crate) fn bricks_elsewhere(&self, tile: &Rect, worker: WorkerId) -> Vec<(&[u32], bool)> {
-        let mut lists: Vec<&Arc<Rendering>> = Vec::new();
-        for rendering in self.leaves_of(tile).filter_map(|leaf| leaf.last.as_ref()) {
-            if rendering.owner != worker && !lists.iter().any(|l| Arc::ptr_eq(l, rendering)) {
-                lists.push(rendering);
-            }
-        }
+        let lists = self.renderings(tile, |owner| owner != worker);
         let is_part = |r: &Rendering| r.tile.union(tile) != *tile;
         lists.into_iter().map(|r| (&r.bricks[..], is_part(r))).collect()
     }
@@ -236,32 +298,73 @@ impl ViewHistory {
         us: f64,
         bricks: &[u32],
     ) {
-        let before = self.cost(tile);
-        let us = match before {
-            Some(last) if last.owner == owner => 0.5 * (last.us + us),
+        let before = self.owner_and_leaves_us(tile);
+        let ratio = time_ratio(tile);
+        let us = match before.map(|(last, leaves_us)| (last, leaves_us * ratio)) {
+            Some((last, last_us)) if last == owner => 0.5 * (last_us + us),
             Some(last) => {
-                rates.compare((owner, us), (last.owner, last.us));
+                rates.compare((owner, us), last);
                 us
             }
             None => us,
         };
-        let us = us / time_ratio(tile);
-        let all: f64 = self.leaves_of(tile).map(|leaf| leaf.us).sum();
-        let count = self.leaves_of(tile).count() as f64;
-        let rendering = Arc::new(Rendering { tile: *tile, owner, bricks: bricks.into() });
+        let us = us / ratio;
+        let all = before.map_or(0.0, |(_, leaves_us)| leaves_us);
+        let count = self.rows(tile).map(|row| row.len()).sum::<usize>() as f64;
+        let new = self.add_rendering(tile, owner, bricks, count as u32);
         for row in self.rows(tile) {
             for leaf in &mut self.leaves[row] {
                 leaf.us = if all > 0.0 { us * leaf.us / all } else { us / count };
-                leaf.last = Some(rendering.clone());
+                if let Some(old) = leaf.last.replace(new) {
+                    let rendering = &mut self.renderings[old as usize];
+                    rendering.leaves -= 1;
+                    if rendering.leaves == 0 {
+                        self.free.push(old);
+                    }
+                }
             }
         }
     }
+
+    /// Adds a rendering of so many leaves, in a free place if there is one. Returns its index.
+    fn add_rendering(&mut self, tile: &Rect, owner: WorkerId, bricks: &[u32], leaves: u32) -> u32 {
+        let index = self.free.pop().unwrap_or_else(|| {
+            let empty = Rendering { tile: *tile, owner, bricks: Vec::new(), leaves };
+            self.renderings.push(empty);
+            self.renderings.len() as u32 - 1
+        });
+        let rendering = &mut self.renderings[index as usize];
+        (rendering.tile, rendering.owner, rendering.leaves) = (*tile, owner, leaves);
+        rendering.bricks.clear();
+        rendering.bricks.extend_from_slice(bricks);
+        index
+    }
+}
+
+/// Returns the number of distinct indices in some lists.
+fn count_distinct<'a>(lists: impl Iterator<Item = &'a [u32]>) -> usize {
+    // A bit for each index, since lists of neighbouring tiles share most of theirs.
+    let mut seen: Vec<u64> = Vec::new();
+    let mut count = 0;
+    for &index in lists.flatten() {
+        let (word, bit) = (index as usize / 64, 1 << (index % 64));
+        if word >= seen.len() {
+            seen.resize(word + 1, 0);
+        }
+        count += usize::from(seen[word] & bit == 0);
+        seen[word] |= bit;
+    }
+    count
 }
 
 /// Returns how many times longer the pixels of a tile take than as part of a tile of [`WHOLE_PX`].
 fn time_ratio(tile: &Rect) -> f64 {
-    let long = tile.width().max(tile.height()) as u32;
-    if long <= WHOLE_PX / 2 { SPLIT_TIME_RATIO } else { 1.0 }
+    edge_time_ratio(tile.width().max(tile.height()) as u32)
+}
+
+/// Returns [`time_ratio`] of tiles of an edge in pixels.
+pub(crate) fn edge_time_ratio(edge: u32) -> f64 {
+    if edge <= WHOLE_PX / 2 { SPLIT_TIME_RATIO } else { 1.0 }
 }
 
 /// All that earlier frames teach.

@@ -86,6 +86,13 @@ impl CostModel {
         (predict_end(&mut items, threads) - master_us).max(master_us)
     }
 
+    /// Returns a time in microseconds before which neither a frame nor its period ends, for so many
+    /// tiles that take `work_us` together: threads that never wait, or the master's time.
+    pub(crate) fn soonest_us(&self, work_us: f64, tiles: usize, threads: usize) -> f64 {
+        let shared = (work_us + self.tile_us * tiles as f64) / threads.max(1) as f64;
+        shared.max(self.master_us(tiles))
+    }
+
     /// Time that so many tiles take the master.
     pub(crate) fn master_us(&self, tiles: usize) -> f64 {
         TILE_MASTER_US * tiles as f64

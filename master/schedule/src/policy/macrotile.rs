@@ -12,7 +12,6 @@
 //! integers, with one line of memory beside the leaves' counts.
 
 use slabcast_common::occlusion::{Rect, ShutMap};
-use std::collections::BTreeSet;
 
 /// Limit: edge of a quadtree leaf in pixels (the paper's choice).
 pub const LEAF: u32 = 16;
@@ -43,7 +42,8 @@ pub struct Cut {
     pub empty: u64,
     /// Tiles of the level with no open pixel left.
     pub shut: u64,
-    /// For each level from `edge` up, row-major: the first place in `tiles` of a tile in it.
+    /// For each level from `edge` up, row-major: the first place in `tiles` of a tile in it. Empty
+    /// for a cut through all depths, in which nobody looks for one.
     first: Vec<Grid<u32>>,
 }
 
@@ -140,7 +140,9 @@ pub fn cut(
     let to_render = |n: &Node| if cull { n.open > 0 } else { n.covered > 0 };
     let tree = tree(leaves(size, rects, shut));
     let level = forced.map(level_of).or_else(|| coarsest(&tree, &to_render, wanted)).unwrap_or(0);
-    list(size, &tree[level], level, &to_render, |rect| shut.all_shut(rect))
+    let mut cut = list(size, &tree[level], level, &to_render, |rect| shut.all_shut(rect));
+    cut.index(size);
+    cut
 }
 
 /// Cuts a slab like [`cut`], then cuts all tiles but the `whole` largest into quarters: the paper's
@@ -201,18 +203,44 @@ impl Through {
         self.tree[level_of(edge)].cells.iter().filter(|n| n.covered > 0).count()
     }
 
-    /// Returns the tiles of a coarse cut, with those that are `cut` replaced by tiles of a fine
-    /// one.
-    pub(crate) fn mixed(&self, coarse: &Cut, fine: &Cut, cut: &[bool]) -> Cut {
-        let corner = |r: &Rect| [r.x0, r.y0].map(|at| at / coarse.edge as i32);
-        let kept = coarse.tiles.iter().zip(cut).filter(|(_, cut)| !**cut).map(|(t, _)| *t);
-        let mut tiles: Vec<Macrotile> = kept.collect();
-        let whole: BTreeSet<[i32; 2]> = tiles.iter().map(|t| corner(&t.rect)).collect();
-        let edge = if tiles.len() < coarse.tiles.len() { fine.edge } else { coarse.edge };
-        tiles.extend(fine.tiles.iter().filter(|t| !whole.contains(&corner(&t.rect))));
-        let mut mixed = Cut { edge, tiles, ..coarse.clone() };
-        mixed.sort(self.size);
-        mixed
+    /// Returns for each leaf of the picture, row by row, whether it is to be rendered.
+    pub(crate) fn leaves(&self) -> impl Iterator<Item = bool> {
+        self.tree[0].cells.iter().map(|n| n.covered > 0)
+    }
+
+    /// Returns the quarters of a tile, of `half` its edge in pixels, that are to be rendered.
+    pub(crate) fn quarters(&self, tile: &Rect, half: u32) -> impl Iterator<Item = Macrotile> {
+        let grid = &self.tree[level_of(half)];
+        let cell = |p: i32| p as usize / half as usize;
+        let (column, row) = (cell(tile.x0), cell(tile.y0));
+        let tile = *tile;
+        [(0, 0), (1, 0), (0, 1), (1, 1)].into_iter().filter_map(move |(x, y)| {
+            let (x0, y0) = (tile.x0 + x * half as i32, tile.y0 + y * half as i32);
+            let rect = Rect::new(x0, y0, x0 + half as i32, y0 + half as i32).intersect(&tile);
+            if rect.is_empty() {
+                return None;
+            }
+            let node = grid.cells[(row + y as usize) * grid.columns + column + x as usize];
+            (node.covered > 0).then_some(Macrotile { rect, est: node.open })
+        })
+    }
+
+    /// Returns the tiles of a coarse cut, with those that are `split` replaced by their quarters.
+    pub(crate) fn mixed(&self, mut coarse: Cut, split: &[bool]) -> Cut {
+        if !split.contains(&true) {
+            return coarse;
+        }
+        let half = coarse.edge / 2;
+        let tiles = coarse.tiles.iter().zip(split).filter(|(_, split)| **split);
+        let parts = tiles.flat_map(|(t, _)| self.quarters(&t.rect, half));
+        let mut parts: Vec<Macrotile> = parts.collect();
+        parts.sort_by_key(|t| (t.rect.y0, t.rect.x0));
+        let mut is_whole = split.iter().map(|split| !split);
+        coarse.tiles.retain(|_| is_whole.next().unwrap_or(true));
+        coarse.tiles.extend(parts);
+        coarse.edge = half;
+        coarse.sort();
+        coarse
     }
 
     /// Returns the tiles of `edge` pixels.
@@ -314,18 +342,17 @@ fn list(
         }
     }
     let mut cut = Cut { edge, tiles, empty, shut: all_shut, first: Vec::new() };
-    cut.sort(size);
+    cut.sort();
     cut
 }
 
 impl Cut {
     /// Sorts the tiles by workload, largest first; equal ones keep their order.
-    pub fn sort(&mut self, size: [u32; 2]) {
+    pub fn sort(&mut self) {
         self.tiles.sort_by_key(|t| std::cmp::Reverse(t.est));
-        self.index(size);
     }
 
-    /// Appends parts of a tile. [`Self::first_in`] must not be called after that.
+    /// Appends parts of a tile.
     pub(crate) fn add(&mut self, parts: Vec<Macrotile>) {
         let long = |t: &Macrotile| t.rect.width().max(t.rect.height()) as u32;
         let edge = parts.iter().map(|t| long(t).next_power_of_two()).max();
@@ -360,7 +387,7 @@ impl Cut {
 
     /// Returns the first index in `tiles` of a tile that `rect` (not empty, inside the picture)
     /// touches. Descends the quadtree and turns back where nothing better can lie below, so a brick
-    /// over the whole picture costs one look and not one for every tile.
+    /// over the whole picture costs one look and not one for every tile. Only for the cut of a slab.
     pub fn first_in(&self, rect: &Rect) -> Option<u32> {
         let mut best = u32::MAX;
         let top = self.first.len() - 1;
@@ -461,15 +488,15 @@ mod tests {
         // Three tiles of 64 in a picture that cuts the last one, and nothing under the second.
         let size = [190, 50];
         let through = Through::new(size, &[Rect::new(0, 0, 60, 50), Rect::new(130, 0, 190, 50)]);
-        let [coarse, fine] = [64, 32].map(|edge| through.cut(edge));
-        assert_eq!((coarse.tiles.len(), fine.tiles.len()), (2, 8));
+        let coarse = through.cut(64);
+        assert_eq!((coarse.tiles.len(), through.cut(32).tiles.len()), (2, 8));
         for (cut, n, edge) in [
             ([false; 2], 2, 64),
             ([true, false], 5, 32),
             ([false, true], 5, 32),
             ([true; 2], 8, 32),
         ] {
-            let mixed = through.mixed(&coarse, &fine, &cut);
+            let mixed = through.mixed(coarse.clone(), &cut);
             assert_eq!((mixed.tiles.len(), mixed.edge), (n, edge));
             let mut over = vec![0; 190 * 50];
             for t in &mixed.tiles {

@@ -149,19 +149,32 @@ pub(crate) fn rebalance(
                 break;
             }
             for &i in &owned[most] {
+                // A fifth, since it takes several moves to level all.
+                let least_gain = 0.2 * slack * mean;
+                let can_gain = |us: f64, best: Option<(f64, usize, Option<usize>, usize)>| {
+                    us > best.map_or(least_gain, |b| b.0)
+                };
                 let mut consider = |from: f64, here: f64, back: Option<usize>, paid: f64| {
                     let gain = load[most] - from.max(here) - SHARED_LINK_RATIO * paid.max(0.0);
-                    // A fifth, since it takes several moves to level all.
-                    if gain > 0.2 * slack * mean && best.is_none_or(|b| gain > b.0) {
+                    if can_gain(gain, best) {
                         best = Some((gain, i, back, to));
                     }
+                    best
                 };
-                let (from, here) = (load[most] - takes(i, most), load[to] + takes(i, to));
+                let leaves = takes(i, most);
+                let (from, here) = (load[most] - leaves, load[to] + takes(i, to));
                 let paid = price(i, to) - price(i, most);
-                consider(from, here, None, paid);
-                for &j in owned[to].iter().filter(|&&j| cost(j, to) < cost(i, to)) {
-                    let (from, here) = (from + takes(j, most), here - takes(j, to));
-                    consider(from, here, Some(j), paid + price(j, most) - price(j, to));
+                let mut best = consider(from, here, None, paid);
+                let cost_here = cost(i, to);
+                for &j in &owned[to] {
+                    // No more is gained than the worker gets rid of, so most are not looked at.
+                    let comes = takes(j, most);
+                    if !can_gain(leaves - comes, best) || cost(j, to) >= cost_here {
+                        continue;
+                    }
+                    let (from, here) = (from + comes, here - takes(j, to));
+                    let paid = paid + price(j, most) - price(j, to);
+                    best = consider(from, here, Some(j), paid);
                 }
             }
         }

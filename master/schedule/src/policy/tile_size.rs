@@ -5,7 +5,7 @@
 //! smaller ones (`cost_history::SPLIT_TIME_RATIO`). Each tile costs its thread and the master a
 //! message. So few large tiles are cheap, and many small ones leave no thread waiting.
 
-use super::cost_history::{SPLIT_TIME_RATIO, ViewHistory, WHOLE_PX};
+use super::cost_history::{SPLIT_TIME_RATIO, TileCost, ViewHistory, WHOLE_PX, edge_time_ratio};
 use super::cost_model::{CostModel, SWITCH_GAIN_RATIO, unknown_unit_us};
 use super::macrotile::{Cut, Macrotile, Through};
 use super::makespan::choose_splits;
@@ -38,60 +38,47 @@ pub(crate) struct CutContext<'a> {
 }
 
 impl CutContext<'_> {
-    /// Returns the rendering time of each tile in microseconds, by history or by estimate.
-    pub(crate) fn times_us(&self, tiles: &[Macrotile]) -> Vec<f64> {
-        let known: Vec<_> =
-            tiles.iter().map(|t| self.history.cost(&t.rect).map(|c| c.us)).collect();
-        let unit = unit_us(tiles, &known);
-        tiles.iter().zip(known).map(|(t, us)| us.unwrap_or(t.est as f64 * unit)).collect()
-    }
-
-    /// Returns the rendering time of a unit of estimated workload.
-    pub(crate) fn unit_us(&self, tiles: &[Macrotile]) -> f64 {
-        let known: Vec<_> =
-            tiles.iter().map(|t| self.history.cost(&t.rect).map(|c| c.us)).collect();
-        unit_us(tiles, &known)
-    }
-
-    /// Whether more than half of these tiles were rendered before.
-    fn knows_most_of(&self, tiles: &[Macrotile]) -> bool {
-        let known = tiles.iter().filter(|t| self.history.cost(&t.rect).is_some()).count();
-        2 * known > tiles.len()
+    /// Looks up what is known of the tiles of a cut.
+    fn price(&self, cut: Cut) -> PricedCut {
+        let costs: Vec<_> = cut.tiles.iter().map(|t| self.history.cost(&t.rect)).collect();
+        let unit_us = unit_us(&cut.tiles, &costs);
+        PricedCut { cut, costs, unit_us }
     }
 
     /// Cuts a frame. `forced`: the tile edge that a user asked for.
-    pub(crate) fn cut(&self, through: &Through, forced: Option<u32>) -> Cut {
+    pub(crate) fn cut(&self, through: &Through, forced: Option<u32>) -> PricedCut {
+        let priced = |edge: u32| self.price(through.cut(edge));
         if let Some(edge) = forced {
-            return through.cut(edge);
+            return priced(edge);
         }
-        let whole = through.cut(WHOLE_PX);
-        let knows_most = self.knows_most_of(&whole.tiles);
-        let edge = match self.history.last_edge {
+        let known = self.history.known_leaves(through.leaves());
+        let knows_most = 2 * known.rendered > known.all;
+        let whole = match self.history.last_edge {
             // The first frame is being rendered.
-            Some(edge) if !knows_most => edge,
-            _ => self.choose_edge(through),
+            Some(edge) if !knows_most => priced(edge),
+            _ => self.choose_edge(through, known.us),
         };
-        if !self.sole || self.bricks_bind || edge != WHOLE_PX || !knows_most {
-            return through.cut(edge);
+        if !self.sole || self.bricks_bind || whole.cut.edge != WHOLE_PX || !knows_most {
+            return whole;
         }
-        let fine = through.cut(WHOLE_PX / 2);
-        let times = self.times_us(&whole.tiles);
+        let us = whole.us();
         let parts = |i: usize| -> Vec<f64> {
-            let tile = &whole.tiles[i];
-            let parts = quarters(&tile.rect).into_iter().flatten();
-            let share = |part: Rect| SPLIT_TIME_RATIO * times[i] * part.area() as f64;
-            let time = |part: Rect| match self.history.cost(&part) {
-                Some(cost) => cost.us,
-                None => share(part) / tile.rect.area() as f64,
-            };
-            parts.filter(|part| fine.first_in(part).is_some()).map(time).collect()
+            let tile = &whole.cut.tiles[i].rect;
+            let share = |part: &Rect| part.area() as f64 / tile.area() as f64;
+            let guess = |part: &Rect| SPLIT_TIME_RATIO * us[i] * share(part);
+            let time = |part: &Rect| self.history.us(part).unwrap_or_else(|| guess(part));
+            through.quarters(tile, WHOLE_PX / 2).map(|part| time(&part.rect)).collect()
         };
-        let split = choose_splits(&self.costs, &times, parts, self.threads);
-        through.mixed(&whole, &fine, &split)
+        let split = choose_splits(&self.costs, &us, parts, self.threads);
+        if !split.contains(&true) {
+            return whole;
+        }
+        self.price(through.mixed(whole.cut, &split))
     }
 
-    /// Returns the edge in pixels for which the frame is predicted to end first.
-    fn choose_edge(&self, through: &Through) -> u32 {
+    /// Returns the tiles of the size for which the frame is predicted to end first. `known_us`: time
+    /// of all leaves that were rendered before, in microseconds.
+    fn choose_edge(&self, through: &Through, known_us: f64) -> PricedCut {
         let largest = match self.is_local {
             true => u32::MAX,
             // What the first frame is cut into the next ones go on with, and nothing is known yet.
@@ -103,49 +90,82 @@ impl CutContext<'_> {
         let least_tiles =
             if self.bricks_bind { self.tiles_per_thread * self.threads as f64 } else { 0.0 };
         let is_fine = |e: u32| e == finest || through.count(e) as f64 > least_tiles;
-        let mut best: Option<(f64, u32)> = None;
-        let mut last = None;
-        let edges = EDGES_PX.into_iter().filter(|e| (finest..=largest).contains(e) && is_fine(*e));
-        for edge in edges {
-            let cut = through.cut(edge);
-            let times = self.times_us(&cut.tiles);
-            let end = if self.sole {
-                self.costs.predict_end_us(&times, self.threads)
-            } else {
-                self.costs.predict_period_us(&times, self.threads)
-            };
-            if self.history.last_edge == Some(edge) {
-                last = Some(end);
+        let may = |edge: u32| (finest..=largest).contains(&edge) && is_fine(edge);
+        // Tiles of another size belong to other workers, which lack their bricks. So the size stays
+        // unless another ends clearly earlier.
+        let last = self.history.last_edge.filter(|edge| may(*edge));
+        let mut best = last.map(|edge| {
+            let kept = self.price(through.cut(edge));
+            ((1.0 - SWITCH_GAIN_RATIO) * self.end_us(&kept), kept)
+        });
+        for edge in EDGES_PX.into_iter().filter(|edge| may(*edge) && last != Some(*edge)) {
+            // Most sizes can't end early enough, and need not be looked at closer.
+            let work_us = edge_time_ratio(edge) * known_us;
+            let soonest = self.costs.soonest_us(work_us, through.count(edge), self.threads);
+            if best.as_ref().is_some_and(|(least, _)| soonest > *least) {
+                continue;
             }
-            // Of equal ones the coarser: fewer messages.
-            if best.is_none_or(|(least, _)| end <= least) {
-                best = Some((end, edge));
+            let cut = self.price(through.cut(edge));
+            let end = self.end_us(&cut);
+            let is_better = |(least, kept): &(f64, PricedCut)| {
+                // Of equal ones the coarser: fewer messages.
+                end < *least || end <= *least && last != Some(kept.cut.edge)
+            };
+            if best.as_ref().is_none_or(is_better) {
+                best = Some((end, cut));
             }
         }
-        let (least, edge) = best.unwrap_or((0.0, WHOLE_PX));
-        match (self.history.last_edge, last) {
-            // Tiles of another size belong to other workers, which lack their bricks.
-            (Some(kept), Some(last)) if least >= (1.0 - SWITCH_GAIN_RATIO) * last => kept,
-            _ => edge,
+        best.map_or_else(|| self.price(through.cut(WHOLE_PX)), |(_, cut)| cut)
+    }
+
+    /// Predicts the end of a sole frame, or the period of overlapping ones, in microseconds.
+    fn end_us(&self, cut: &PricedCut) -> f64 {
+        match self.sole {
+            true => self.costs.predict_end_us(&cut.us(), self.threads),
+            false => self.costs.predict_period_us(&cut.us(), self.threads),
         }
     }
 }
 
-/// Returns the rendering time of a unit of estimated workload, the mean of tiles with known times.
-fn unit_us(tiles: &[Macrotile], known_us: &[Option<f64>]) -> f64 {
-    let known = tiles.iter().zip(known_us).filter_map(|(t, us)| Some((t.est as f64, (*us)?)));
-    let (units, us) = known.fold((0.0, 0.0), |(a, b), (units, us)| (a + units, b + us));
-    if units > 0.0 && us > 0.0 { us / units } else { unknown_unit_us() }
+/// Tiles with what is known of them.
+pub(crate) struct PricedCut {
+    pub(crate) cut: Cut,
+    /// What is known of each tile.
+    pub(crate) costs: Vec<Option<TileCost>>,
+    /// Rendering time of a unit of estimated workload in microseconds.
+    pub(crate) unit_us: f64,
 }
 
-/// Returns the parts of half of [`WHOLE_PX`] that a tile is split into; fewer at the border.
-fn quarters(tile: &Rect) -> [Option<Rect>; 4] {
-    let half = WHOLE_PX as i32 / 2;
-    [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(x, y)| {
-        let (x0, y0) = (tile.x0 + x * half, tile.y0 + y * half);
-        let part = Rect::new(x0, y0, x0 + half, y0 + half).intersect(tile);
-        Some(part).filter(|r| !r.is_empty())
-    })
+impl PricedCut {
+    /// Returns the rendering time of each tile in microseconds, by history or by estimate.
+    fn us(&self) -> Vec<f64> {
+        let us = |(tile, cost): (&Macrotile, &Option<TileCost>)| {
+            cost.map_or(tile.est as f64 * self.unit_us, |cost| cost.us)
+        };
+        self.cut.tiles.iter().zip(&self.costs).map(us).collect()
+    }
+
+    /// Turns estimates into predicted times, in the units of those that are guessed, and sorts the
+    /// tiles by them, longest first.
+    pub(crate) fn sort_by_time(&mut self) {
+        let us = self.us();
+        let tiles = self.cut.tiles.iter().zip(us).zip(&self.costs);
+        let mut tiles: Vec<(Macrotile, Option<TileCost>)> = tiles
+            .map(|((tile, us), cost)| {
+                let est = ((us / self.unit_us) as u64).max(1);
+                (Macrotile { est, ..*tile }, *cost)
+            })
+            .collect();
+        tiles.sort_by_key(|(tile, _)| std::cmp::Reverse(tile.est));
+        (self.cut.tiles, self.costs) = tiles.into_iter().unzip();
+    }
+}
+
+/// Returns the rendering time of a unit of estimated workload, the mean of tiles with known times.
+fn unit_us(tiles: &[Macrotile], costs: &[Option<TileCost>]) -> f64 {
+    let known = tiles.iter().zip(costs).filter_map(|(t, cost)| Some((t.est as f64, (*cost)?.us)));
+    let (units, us) = known.fold((0.0, 0.0), |(a, b), (units, us)| (a + units, b + us));
+    if units > 0.0 && us > 0.0 { us / units } else { unknown_unit_us() }
 }
 
 #[cfg(test)]
@@ -167,7 +187,7 @@ mod tests {
         let tiles_per_thread = 2.5;
         let context =
             CutContext { costs, history, threads, tiles_per_thread, sole, is_local, bricks_bind };
-        context.cut(&through, None).edge
+        context.cut(&through, None).cut.edge
     }
 
     #[test]
@@ -210,7 +230,7 @@ mod tests {
                 bricks_bind: false,
             };
             // 64 tiles of 64 pixels for 21 threads: 12.2 of four frames each.
-            let chosen = context.cut(&picture(64), None).edge;
+            let chosen = context.cut(&picture(64), None).cut.edge;
             assert!(chosen == last || chosen == 64, "{last}: {chosen}");
         }
         let _ = WorkerId(0);

@@ -84,8 +84,8 @@ impl LeaseTable {
     }
 
     /// Returns the indices of a worker's leases that are of the current phase, oldest first.
-    pub(crate) fn places(&self, id: WorkerId) -> Vec<u32> {
-        self.lent(id).iter().filter_map(|l| self.queue.place(l.task)).collect()
+    pub(crate) fn places(&self, id: WorkerId) -> impl Iterator<Item = u32> {
+        self.lent(id).iter().filter_map(|l| self.queue.place(l.task))
     }
 
     /// Whether a worker has this lease.

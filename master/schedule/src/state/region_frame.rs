@@ -8,11 +8,11 @@
 
 use crate::dispatch::steal::Splits;
 use crate::policy::assign::{Group, TileToAssign};
-use crate::policy::cost_history::{HistoryKey, WHOLE_PX};
+use crate::policy::cost_history::{HistoryKey, TileCost, WHOLE_PX};
 use crate::policy::cost_model::{CostModel, SWITCH_GAIN_RATIO, WORTHWHILE_RATIO};
 use crate::policy::macrotile::{Macrotile, Through};
 use crate::policy::prefetch::TileOwnerGrid;
-use crate::policy::tile_size::CutContext;
+use crate::policy::tile_size::{CutContext, PricedCut};
 use crate::state::cluster::Cluster;
 use crate::state::frame::{FrameCore, Stage, TILES_LAID_TOGETHER, send_bricks};
 use crate::state::region_tiles::{Predicted, RegionTiles};
@@ -83,8 +83,7 @@ impl RegionFrame {
         let group = Group::new(roster.lane(self.lane));
         let threads = group.threads();
         let costs = CostModel::new(&cluster.link_use, roster);
-        let bytes: u64 = job.bricks.iter().map(|b| u64::from(b.bytes)).sum();
-        let brick_us = costs.brick_us(bytes as f64 / job.bricks.len().max(1) as f64);
+        let brick_us = costs.brick_us(cluster.residency.brick_bytes(set));
         cluster.history.view_mut(self.key);
         let history = cluster.history.view(self.key).expect("just made");
         let context = CutContext {
@@ -97,35 +96,29 @@ impl RegionFrame {
             // No worker holds a brick in the first frame.
             bricks_bind: history.is_empty() || sole && cluster.link_use.bricks_bind(),
         };
-        let mut cut = context.cut(&through, job.work.tile);
-
-        // Estimates become predicted times, in the units of those that are guessed.
-        let unit = context.unit_us(&cut.tiles);
-        let times = context.times_us(&cut.tiles);
-        for (tile, us) in cut.tiles.iter_mut().zip(times) {
-            tile.est = ((us / unit) as u64).max(1);
-        }
-        cut.sort(size);
+        let mut priced = context.cut(&through, job.work.tile);
+        priced.sort_by_time();
+        let PricedCut { cut, costs: costs_known, unit_us: unit } = priced;
+        // The first frame is cut into bands; while it is rendered others begin, and most of their
+        // times are guesses.
+        let known = costs_known.iter().flatten().count();
+        let may_move = 2 * known >= cut.tiles.len() && group.has_several();
+        let slack = if sole { WORTHWHILE_RATIO } else { SWITCH_GAIN_RATIO };
+        let slack = may_move.then_some(slack);
         let is_there = |id: &WorkerId| roster.get(*id).is_some_and(|w| !w.leaving);
-        let to_assign = |tile: &Macrotile| {
-            let cost = history.cost(&tile.rect);
+        let to_assign = |(tile, cost): (&Macrotile, &Option<TileCost>)| {
             let us = cost.map_or(tile.est as f64 * unit, |c| c.us);
             let home = || history.home(&tile.rect).filter(is_there);
             let last = cost.map(|c| c.owner);
+            let bricks = if may_move { history.bricks(&tile.rect) } else { 0 };
             TileToAssign {
                 us,
-                cost,
+                cost: *cost,
                 owner: if sole { last.or_else(home) } else { home().or(last) },
-                price_us: brick_us * cost.map_or(0, |c| c.bricks) as f64,
+                price_us: brick_us * bricks as f64,
             }
         };
-        let tiles: Vec<_> = cut.tiles.iter().map(to_assign).collect();
-        // The first frame is cut into bands; while it is rendered others begin, and most of their
-        // times are guesses.
-        let known = tiles.iter().filter(|t| t.cost.is_some()).count();
-        let may_move = 2 * known >= tiles.len();
-        let slack = if sole { WORTHWHILE_RATIO } else { SWITCH_GAIN_RATIO };
-        let slack = may_move.then_some(slack);
+        let tiles: Vec<_> = cut.tiles.iter().zip(&costs_known).map(to_assign).collect();
         let owners = group.assign(&cut.tiles, &tiles, &cluster.history.rates, roster, slack);
         let predicted = |t: &TileToAssign| Some(Predicted { worker: t.cost?.owner, us: t.us });
         let predicted: Vec<_> = tiles.iter().map(predicted).collect();

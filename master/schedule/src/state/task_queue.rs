@@ -203,7 +203,7 @@ impl TaskQueue {
     pub(crate) fn next_for(
         &self,
         worker: WorkerId,
-        mine: &[u32],
+        mine: impl Fn() -> Vec<u32>,
         among: impl Fn(u32) -> bool,
         others: impl Fn(&Task) -> bool,
         suits: impl Fn(u32) -> bool,
@@ -217,12 +217,17 @@ impl TaskQueue {
     fn fits(
         &self,
         worker: WorkerId,
-        mine: &[u32],
+        mine: impl Fn() -> Vec<u32>,
         others: impl Fn(&Task) -> bool,
     ) -> impl Fn(u32) -> bool {
-        let has_suspect = mine.iter().any(|&p| self.tasks[p as usize].is_suspect());
         move |place| {
             let task = &self.tasks[place as usize];
+            // Nobody has it, was lost with it or refused it.
+            if !task.was_leased() {
+                return true;
+            }
+            let mine = mine();
+            let has_suspect = mine.iter().any(|&p| self.tasks[p as usize].is_suspect());
             let has_it = mine.contains(&place);
             let failed = task.failed.iter().any(|(w, ..)| *w == worker) && others(task);
             let two_suspects = has_suspect && task.is_suspect();
@@ -235,7 +240,7 @@ impl TaskQueue {
     pub(crate) fn next_among(
         &self,
         worker: WorkerId,
-        mine: &[u32],
+        mine: impl Fn() -> Vec<u32>,
         places: &[u32],
         others: impl Fn(&Task) -> bool,
     ) -> Option<u32> {
@@ -433,7 +438,7 @@ mod tests {
     }
 
     fn next(q: &TaskQueue, w: u64, mine: &[u32]) -> Option<u32> {
-        q.next_for(WorkerId(w), mine, |_| true, |_| true, |_| true)
+        q.next_for(WorkerId(w), || mine.to_vec(), |_| true, |_| true, |_| true)
     }
 
     fn take(q: &mut TaskQueue, w: u64, mine: &[u32], now: Micros) -> (u32, Epoch) {
@@ -471,6 +476,7 @@ mod tests {
         let c = Config::default();
         let mut q = queue(6);
         let same = |q: &TaskQueue, own: &[u32], mine: &[u32]| {
+            let mine = || mine.to_vec();
             let all = q.next_for(WorkerId(1), mine, |p| own.contains(&p), |_| true, |_| true);
             assert_eq!(q.next_among(WorkerId(1), mine, own, |_| true), all);
             assert_eq!(q.any_waiting(own), own.iter().any(|p| q.all_waiting().any(|w| w == *p)));
@@ -578,10 +584,10 @@ mod tests {
             // Worker 1 gets it again only while there is nobody else.
             let alone = w == 1;
             assert_eq!(
-                q.next_for(WorkerId(1), &[], |_| true, |_| true, |_| true).is_none(),
+                q.next_for(WorkerId(1), Vec::new, |_| true, |_| true, |_| true).is_none(),
                 !q.tasks[0].failed.is_empty(),
             );
-            let place = q.next_for(WorkerId(w), &[], |_| true, |_| !alone, |_| true).unwrap();
+            let place = q.next_for(WorkerId(w), Vec::new, |_| true, |_| !alone, |_| true).unwrap();
             let epoch = q.lease(place, WorkerId(w), 0, &c);
             let given_up = q.fail(0, epoch, WorkerId(w), "x", "no".into(), &c);
             assert_eq!(given_up.len(), usize::from(w == 2));

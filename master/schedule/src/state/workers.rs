@@ -120,6 +120,10 @@ pub(crate) struct Roster {
     changes: u64,
     /// Most workers that are active.
     limit: usize,
+    /// Longest round trip to an active worker in microseconds, by each one's best ping, and whether
+    /// most active threads are on the master's host. Each event asks, and both change seldom.
+    round_trip_us: Micros,
+    is_mostly_local: bool,
 }
 
 impl Default for Roster {
@@ -133,6 +137,8 @@ impl Default for Roster {
             idle: 0,
             changes: 0,
             limit: usize::MAX,
+            round_trip_us: 0,
+            is_mostly_local: false,
         }
     }
 }
@@ -168,6 +174,7 @@ impl Roster {
         self.changes += 1;
         self.quiet_until = self.quiet_until.min(now);
         self.choose();
+        self.survey();
     }
 
     pub(crate) fn remove(&mut self, id: WorkerId) -> Option<Worker> {
@@ -176,6 +183,7 @@ impl Roster {
         self.threads -= if worker.is_active() { u64::from(worker.threads) } else { 0 };
         self.changes += 1;
         self.choose();
+        self.survey();
         Some(worker)
     }
 
@@ -191,6 +199,7 @@ impl Roster {
         if self.limit != limit {
             self.limit = limit;
             self.choose();
+            self.survey();
         }
     }
 
@@ -235,6 +244,7 @@ impl Roster {
             self.threads -= if w.is_spare { 0 } else { u64::from(w.threads) };
             self.changes += 1;
             self.choose();
+            self.survey();
         }
         news
     }
@@ -290,17 +300,23 @@ impl Roster {
         })
     }
 
+    /// Looks at all active workers: how far away they are.
+    fn survey(&mut self) {
+        let half = self.active().filter_map(|(_, w)| Some(w.offset?.half_rtt)).max();
+        let local = self.active().filter(|(_, w)| w.is_local).map(|(_, w)| u64::from(w.threads));
+        self.is_mostly_local = 2 * local.sum::<u64>() > self.threads;
+        self.round_trip_us = 2 * half.unwrap_or(0);
+    }
+
     /// Whether most active threads are on the master's host.
     pub(crate) fn is_mostly_local(&self) -> bool {
-        let local = self.active().filter(|(_, w)| w.is_local).map(|(_, w)| u64::from(w.threads));
-        2 * local.sum::<u64>() > self.threads
+        self.is_mostly_local
     }
 
     /// Returns the longest round trip to an active worker in microseconds, by each one's best ping;
     /// 0 before any pong.
     pub(crate) fn round_trip_us(&self) -> f64 {
-        let half = self.active().filter_map(|(_, w)| Some(w.offset?.half_rtt)).max();
-        2.0 * half.unwrap_or(0) as f64
+        self.round_trip_us as f64
     }
 
     /// Returns the number of render threads of active workers.
@@ -386,6 +402,7 @@ impl Roster {
         });
         if better {
             w.offset = Some(Offset { us, half_rtt, at: now });
+            self.survey();
         }
         true
     }

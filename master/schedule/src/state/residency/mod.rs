@@ -463,6 +463,11 @@ impl Residency {
         self.sets.get(&key).map_or(0, |set| set.voxels)
     }
 
+    /// Returns the mean number of encoded bytes of the bricks of an open set.
+    pub(crate) fn brick_bytes(&self, key: BrickSetKey) -> f64 {
+        self.sets.get(&key).map_or(0.0, |set| set.all_bytes as f64 / set.bricks.len().max(1) as f64)
+    }
+
     /// Returns how many workers of mean budget are needed to hold an open set, each brick
     /// [`COPIES`]-fold.
     pub(crate) fn workers_to_hold(&self, key: BrickSetKey) -> usize {

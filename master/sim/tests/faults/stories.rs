@@ -312,7 +312,7 @@ fn straggler_delays_a_frame_by_less_than_a_third() {
         );
         worst = worst.max(ratio);
         // At the end of each of three slabs, others also draw the tiles of the slow one.
-        let most = 0.15;
+        let most = if schedule == Schedule::Region { 0.1 } else { 0.15 };
         assert!(twice <= most, "{:.1} % of the tiles", 100.0 * twice);
     }
     assert!(worst <= 1.3, "{worst:.2} x");
@@ -540,7 +540,7 @@ fn sole_frame_with_few_long_tiles_is_cut_so_that_threads_end_together() {
     assert_eq!(sizes(&w, 0).keys().copied().collect::<Vec<_>>(), [64], "nothing is known yet");
     let both = sizes(&w, 3);
     assert!(both.contains_key(&64) && both.contains_key(&32), "{both:?}");
-    assert!(100 * cut < 93 * whole, "{cut} us, in tiles of 64 {whole}");
+    assert!(10 * cut < 9 * whole, "{cut} us, in tiles of 64 {whole}");
 }
 
 /// Three workers draw a frame that they know; 3 ms into it, `what` happens to the first of them.
@@ -619,7 +619,7 @@ fn work_stealing_shares_the_last_tile_of_a_slow_worker() {
         (before[2], took, parts + w.observer.done[&FrameId(3)].stats.handed_over)
     };
     let (before, steady, _) = run(1.0);
-    assert!(steady < before + before / 8, "{steady} us after {before}");
+    assert!(steady < before + before / 10, "{steady} us after {before}");
     // Others draw parts of its second tile, or pieces of its first.
     let (before, late, parts) = run(1.5);
     assert!(parts > 0);
@@ -679,7 +679,7 @@ fn workers_get_shares_of_a_path_by_their_speed() {
     ] {
         let ratio = run(&speeds) / healthy;
         assert!(
-            ratio <= 1.06,
+            ratio <= 1.04,
             "{speeds:?}: {ratio:.3} times as long as equals of the same strength"
         );
     }

@@ -182,8 +182,8 @@ impl ViewHistory {
         self.rows(tile).flat_map(|row| &self.leaves[row])
     }
 
-    /// Returns the rendering time of a tile in microseconds, however earlier frames were cut; `None`:
-    /// no part of it was rendered.
+    /// Returns the rendering time of a tile in microseconds, however earlier frames were cut;
+    /// `None`: no part of it was rendered.
     pub(crate) fn us(&self, tile: &Rect) -> Option<f64> {
         self.cost(tile).map(|cost| cost.us)
     }

@@ -387,7 +387,8 @@ impl Cut {
 
     /// Returns the first index in `tiles` of a tile that `rect` (not empty, inside the picture)
     /// touches. Descends the quadtree and turns back where nothing better can lie below, so a brick
-    /// over the whole picture costs one look and not one for every tile. Only for the cut of a slab.
+    /// over the whole picture costs one look and not one for every tile. Only for the cut of a
+    /// slab.
     pub fn first_in(&self, rect: &Rect) -> Option<u32> {
         let mut best = u32::MAX;
         let top = self.first.len() - 1;

@@ -76,8 +76,8 @@ impl CutContext<'_> {
         self.price(through.mixed(whole.cut, &split))
     }
 
-    /// Returns the tiles of the size for which the frame is predicted to end first. `known_us`: time
-    /// of all leaves that were rendered before, in microseconds.
+    /// Returns the tiles of the size for which the frame is predicted to end first. `known_us`:
+    /// time of all leaves that were rendered before, in microseconds.
     fn choose_edge(&self, through: &Through, known_us: f64) -> PricedCut {
         let largest = match self.is_local {
             true => u32::MAX,

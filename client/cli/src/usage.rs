@@ -30,13 +30,15 @@ pub(crate) fn understood(e: &clap::Error) -> Fail {
 /// Returns clap's paragraphs as one line: what is wrong, its tips, and where to read on.
 fn one_sentence(text: &str, typed: &[String]) -> String {
     let mut parts: Vec<String> = Vec::new();
-    // Where clap says no usage, the first word tells.
-    let mut help = match typed.first() {
-        Some(name) if command().find_subcommand(name).is_some() => {
-            format!("slabcast {name} --help")
-        }
-        _ => "slabcast --help".to_string(),
-    };
+    // Where clap prints no usage, the words that were typed tell the command.
+    let program = command();
+    let (mut named, mut help) = (&program, "slabcast".to_string());
+    for word in typed {
+        let Some(inner) = named.find_subcommand(word) else { break };
+        named = inner;
+        help = format!("{help} {}", inner.get_name());
+    }
+    help += " --help";
     for line in text.lines().map(str::trim).filter(|l| !l.is_empty()) {
         if let Some(usage) = line.strip_prefix("Usage: ") {
             // `slabcast render [OPTIONS] ...`: the program, whatever it is called here, and the
@@ -48,8 +50,8 @@ fn one_sentence(text: &str, typed: &[String]) -> String {
                 help = format!("{help} {word}");
             }
             help += " --help";
-        } else if line.starts_with("For more information") {
-            // Said in fewer words below.
+        } else if line.starts_with("For more information") || line.starts_with("slabcast ") {
+            // Said in fewer words below; and the second form of a usage.
         } else if let Some(tip) = line.strip_prefix("tip: ") {
             parts.push(tip.replace('\'', "`"));
         } else {

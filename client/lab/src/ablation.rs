@@ -183,7 +183,7 @@ pub(crate) fn measure(of: &VolumeSceneArgs, threads: usize) -> Result<Savings, F
     }
     if spec.transfer.gradient_opacity.is_empty() {
         let keep = Keep { gradients: true, ..Keep::default() };
-        kept("gradients", "no opacity hangs on them".into(), keep, "--keep gradients")?;
+        kept("gradients", "no opacity depends on them".into(), keep, "--keep gradients")?;
     } else {
         later.push(needed("gradients", "they modulate opacity"));
     }

@@ -33,6 +33,15 @@ fn clap_errors_become_one_line() {
              1/512; see `slabcast render --help`",
         ),
         (
+            "slabcast lab plan x --link 3bananas",
+            "invalid value `3bananas` for `--link <RATE>`: give a rate, as 1gbit, 10gbit or \
+             100mbit, or unlimited; see `slabcast lab plan --help`",
+        ),
+        (
+            "slabcast lab check nosuch",
+            "unrecognized subcommand `nosuch`; see `slabcast lab check --help`",
+        ),
+        (
             "slabcast-0.1 worker",
             "the following required arguments were not provided: --master <HOST:PORT>; see \
              `slabcast-0.1 worker --help`",

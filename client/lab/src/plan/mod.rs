@@ -341,11 +341,11 @@ fn pings_line(pings: Option<&Pings>) -> String {
     };
     let us = |ns: &[u64; 3]| ns.map(|ns| format!("{:.1}", ns as f64 / 1e3)).join(", ");
     format!(
-        "a ping and its pong take the master's driver, its streams, a worker {} us alone, {} in \
-         the company of {}",
+        "a ping and its pong cost the master's driver, its streams and the worker {} us with one \
+         worker, {} with {}",
         us(alone_ns),
         us(company_ns),
-        pings::COMPANY - 1
+        pings::COMPANY
     )
 }
 

@@ -59,7 +59,8 @@ pub fn run(args: &ReplayArgs) -> Result<(), Fail> {
     if let Some(d) = difference {
         return Err(Fail::failed(format!(
             "{shown}: line {}: after {events} events and {decisions} decisions that are the same, \
-             recorded `{}`, replayed `{}`",
+             recorded `{}`, replayed `{}`; slabcast {program} recorded it, and another build may \
+             decide otherwise",
             d.line, d.recorded, d.replayed
         )));
     }

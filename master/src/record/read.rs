@@ -199,11 +199,11 @@ pub fn replay(from: impl BufRead) -> Result<ReplaySummary, RecordError> {
                 done.events += 1;
                 let left = clock.left.borrow().len();
                 if clock.too_many.get() || left > 0 {
-                    let more = if clock.too_many.get() { "more often" } else { "less often" };
+                    let more = if clock.too_many.get() { "more" } else { "fewer" };
                     done.difference = Some(Difference {
                         line: reader.line,
-                        recorded: "the readings of the clock in this line".into(),
-                        replayed: format!("it is read {more}"),
+                        recorded: "the clock readings of this line".into(),
+                        replayed: format!("{more} readings"),
                     });
                     return Ok(done);
                 }

@@ -50,7 +50,7 @@ for name in "$@"; do
         ;;
     faults)
         campaign faults \
-            '/ frames, .* leases, / {
+            '/ frames, .* retries, / {
                  campaigns++
                  for (i = 2; i <= NF; i++) {
                      if ($i == "frames,") frames += $(i - 1)

@@ -14,10 +14,10 @@ use crate::view::{Projected, Projection, SUBPIXELS, View};
 use glam::DVec3;
 use std::f64::consts::PI;
 
-/// What integer sums leave free above a solid of the largest extinction: ripple takes at most
-/// 5 % for every kernel that `Quality::check` lets through but the narrowest, and the factor of
-/// two up to 2^31 takes those. At half, single voxels of narrow kernels overflow; at double,
-/// one bit of precision is given away.
+/// Room that integer sums leave above a solid of the largest payload, as a factor. Ripple takes at
+/// most 5 % for every kernel that `Quality::check` lets through but the narrowest, and the factor
+/// of two up to 2^31 takes those. At half, single voxels of narrow kernels overflow; at double, one
+/// bit of precision is given away.
 const HEADROOM: f64 = 1.05;
 
 /// Returns the raw units of a 32-bit sum for one unit of payload: 2^30 is a sheet of `thickness`

@@ -148,7 +148,7 @@ fn percent(part: u64, whole: u64) -> String {
     }
 }
 
-/// What a master and a worker take beside samples and bricks, for pictures of 512x512: three
+/// Bytes that a master and a worker hold beside samples and bricks, for pictures of 512x512: three
 /// frames in flight, streams, tables. Measured on mri256, chris_t1, aneurism and lidc0314 with
 /// 1 and 2 threads (VmHWM less samples and bricks): 55 to 65 MiB and 25 to 32 MiB. A master's
 /// part grows with the picture, by 3.7 GiB at 8192x8192.

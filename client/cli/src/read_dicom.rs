@@ -13,7 +13,7 @@ Examples:
 pub(crate) struct DicomArgs {
     /// Folder of the slices
     folder: PathBuf,
-    /// Which series
+    /// Series to read: its number, description or UID
     #[arg(long)]
     series: Option<String>,
     /// A slice of the series

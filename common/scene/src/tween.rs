@@ -304,7 +304,7 @@ mod tests {
     }
 
     proptest! {
-        /// What a frame sees, one of the ends sees.
+        /// A value that a frame between two keys shows is shown at one of the keys.
         #[test]
         fn tween_supports_lie_in_the_union_of_the_keys(
             a in prop::collection::vec((0u32..64, 0u32..3), 1..6),

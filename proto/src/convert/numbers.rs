@@ -70,7 +70,7 @@ pub(super) fn check_lattice(lattice: &Lattice, dims: &str, fields: &str) -> Resu
     lattice.check().map_err(|problem| WireError::value(fields, problem))
 }
 
-/// Fields that say what values a volume has; the messages of both packages have them by these names.
+/// Value range and histogram of a volume, as `Volume` has them in both packages of the wire.
 pub(super) struct SummaryFields {
     pub(super) value_scale: Option<f64>,
     pub(super) value_offset: Option<f64>,

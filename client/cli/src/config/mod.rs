@@ -158,8 +158,8 @@ fn names(arg: &Arg) -> impl Iterator<Item = &str> {
     arg.get_long().into_iter().chain(arg.get_all_aliases().unwrap_or_default())
 }
 
-/// Which command the line is, and what each of its arguments is given by which layer. `None`
-/// where the command has no layers.
+/// Returns the command of a line, and the value and layer (flag, variable, file, default) of each
+/// of its arguments. `None`: the command takes no values from layers.
 fn layers(command: &Command, line: &[OsString]) -> Result<Option<(String, Vec<Given>)>, Trouble> {
     let mut loose = command.clone();
     for name in LAYERED {

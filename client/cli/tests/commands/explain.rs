@@ -106,8 +106,8 @@ fn ablation_of_unneeded_brick_content_changes_no_pixel() {
     }
 }
 
-/// What `--keep` keeps is kept by a master and its workers too; the statistics no longer name it,
-/// and the picture is the same.
+/// `--keep NAME` turns an optimisation off at the master and its workers: a frame's statistics
+/// don't list it under `left_out`, and the picture stays the same.
 #[test]
 fn keep_flag_is_not_reported_as_left_out() {
     let dir = tempfile::tempdir().unwrap();

@@ -19,7 +19,7 @@ fn data() -> Option<PathBuf> {
     }
 }
 
-/// What `slabcast info --json` says.
+/// Returns the JSON that `slabcast info --json` prints.
 fn info(dir: &Path, file: &Path, more: &[&str]) -> serde_json::Value {
     let file = file.to_string_lossy();
     let out = good(dir, &[&["info", &file, "--json"], more].concat());

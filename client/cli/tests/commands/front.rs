@@ -180,8 +180,8 @@ fn error_target_is_kept_on_a_cluster() {
     assert!(quality["thickness"].as_f64().unwrap() <= 0.25, "all the time in the world: {quality}");
 }
 
-/// What a frame's statistics say of errors, beside the reference's word: estimates of RMSE, and
-/// bounds that hold on every pixel.
+/// A frame's statistics estimate the RMSE of each error source within a factor of two of the f64
+/// reference's, and no pixel is off by more than their bounds.
 #[test]
 fn statistics_contain_error_estimates_by_source() {
     let dir = tempfile::tempdir().unwrap();

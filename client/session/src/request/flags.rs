@@ -108,7 +108,7 @@ pub struct ViewArgs {
     #[arg(long, value_name = "DEG", value_parser = parse::positive, allow_negative_numbers = true,
           hide_short_help = true)]
     fov: Option<f64>,
-    /// Which world axes are up and front.
+    /// World axes that are up and front.
     #[command(flatten)]
     pub axes: AxisArgs,
     /// Views, turntable, key frames or a flight from a file
@@ -351,8 +351,8 @@ pub struct WorkArgs {
     #[arg(long, value_name = "N", default_value = "3", hide_short_help = true,
           value_parser = clap::value_parser!(u32).range(1..=1000))]
     slabs: u32,
-    /// Wanted ratio of macrotiles to render threads; by region only while bricks still arrive, later
-    /// frames are cut by measured times
+    /// Wanted ratio of macrotiles to render threads; by region only while bricks still arrive,
+    /// later frames are cut by measured times
     #[arg(long, alias = "tiles-per-worker", value_name = "RATIO", default_value = "2.5",
           value_parser = parse::positive, allow_negative_numbers = true, hide_short_help = true)]
     tiles_per_thread: f64,

@@ -39,7 +39,7 @@ pub(crate) const SETTLE_FRAMES: u32 = 5;
 /// active set brings as many again, and has to pay for them within as many frames.
 const FRAMES_PER_VIEW: f64 = 25.0;
 
-/// What a frame cost that ended.
+/// Times of a frame that ended, and the workers that drew it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FrameCost {
     /// No other frame was in flight.

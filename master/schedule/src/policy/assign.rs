@@ -17,11 +17,11 @@ use slabcast_common::ids::WorkerId;
 pub(crate) struct TileToAssign {
     /// Predicted rendering time in microseconds, by the worker that rendered it last.
     pub(crate) us: f64,
-    /// What is known of it.
+    /// Rendering time and owner of the same pixels in earlier frames; `None`: never rendered.
     pub(crate) cost: Option<TileCost>,
-    /// Its owner in the frame before.
+    /// Worker that owned the tile in the frame before.
     pub(crate) owner: Option<WorkerId>,
-    /// Time that its bricks take another worker, in microseconds.
+    /// Time to send the tile's bricks to another worker, in microseconds.
     pub(crate) price_us: f64,
 }
 

@@ -106,12 +106,12 @@ struct Rendering {
     leaves: u32,
 }
 
-/// What is known of one leaf.
+/// Rendering history of one leaf (16x16 pixels).
 #[derive(Clone, Debug, Default)]
 struct LeafCost {
     /// Rendering time in microseconds, as part of a tile of [`WHOLE_PX`] pixels or more.
     us: f64,
-    /// Its last rendering: an index of `ViewHistory::renderings`.
+    /// Index in `ViewHistory::renderings` of the leaf's last rendering; `None`: never rendered.
     last: Option<u32>,
     /// Owner of the leaf's tile in the frame that was cut last, rendered or not. A worker that
     /// steals a tile does so once: in the next frame the tile goes back to where its neighbours
@@ -119,23 +119,23 @@ struct LeafCost {
     home: Option<WorkerId>,
 }
 
-/// What is known of a tile.
+/// Rendering time of a tile, however earlier frames were cut.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct TileCost {
-    /// Worker that rendered most of it.
+    /// Worker that rendered most of the tile.
     pub(crate) owner: WorkerId,
     /// Rendering time in microseconds.
     pub(crate) us: f64,
 }
 
-/// What is known of the leaves of a picture that are to be rendered.
+/// Rendering history of the leaves that a frame will render, summed.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct KnownLeaves {
     /// Number of leaves.
     pub(crate) all: usize,
-    /// Number of those that were rendered before.
+    /// Number of leaves that were rendered before.
     pub(crate) rendered: usize,
-    /// Time of all in microseconds, as part of tiles of [`WHOLE_PX`] pixels or more.
+    /// Rendering time of all in microseconds, as part of tiles of [`WHOLE_PX`] pixels or more.
     pub(crate) us: f64,
 }
 

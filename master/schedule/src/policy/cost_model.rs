@@ -98,8 +98,8 @@ impl CostModel {
         TILE_MASTER_US * tiles as f64
     }
 
-    /// What a tile takes its thread, in sixteenths of a microsecond: integers sort in a third of
-    /// the time.
+    /// Returns the time that a thread spends on a tile of `us` microseconds, in sixteenths of a
+    /// microsecond: integers sort in a third of the time.
     pub(crate) fn item(&self, us: f64) -> u64 {
         (16.0 * (us + self.tile_us)) as u64
     }

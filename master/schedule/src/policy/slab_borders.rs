@@ -55,7 +55,7 @@ pub fn slab_ranges(
 /// A brick, for the search of borders.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Guess {
-    /// Its first sheet.
+    /// Number of the brick's first sheet.
     first: i32,
     /// A slab that begins at this sheet or behind needs the brick no more.
     hidden: i32,

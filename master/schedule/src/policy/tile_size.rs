@@ -19,7 +19,7 @@ const EDGES_PX: [u32; 4] = [32, 64, 128, 256];
 /// in tiles of 128 pixels (mri256 at 1024x1024) and 77 % in tiles of 256.
 const MAX_REMOTE_TILE_PX: u32 = 128;
 
-/// What is known before a frame is cut.
+/// Facts by which a frame is cut into tiles.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CutContext<'a> {
     pub(crate) costs: CostModel,
@@ -130,7 +130,7 @@ impl CutContext<'_> {
 /// Tiles with what is known of them.
 pub(crate) struct PricedCut {
     pub(crate) cut: Cut,
-    /// What is known of each tile.
+    /// Rendering time and owner of each tile in earlier frames; `None`: never rendered.
     pub(crate) costs: Vec<Option<TileCost>>,
     /// Rendering time of a unit of estimated workload in microseconds.
     pub(crate) unit_us: f64,

@@ -78,7 +78,7 @@ impl BrickUse {
     }
 }
 
-/// What frames of both schedules have.
+/// State that a frame has under either schedule.
 #[derive(Debug)]
 pub(crate) struct FrameCore {
     pub(crate) job: Box<FrameJob>,
@@ -128,7 +128,7 @@ pub(crate) enum Step {
     Failed(String),
 }
 
-/// What a step of one frame may do, given the other frames in flight.
+/// Freedom of one step of a frame, given the other frames in flight.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct StepContext {
     /// No later frame is in flight or queued whose tasks could keep idle threads busy.

@@ -9,11 +9,11 @@ use slabcast_common::ids::WorkerId;
 pub(crate) struct Predicted {
     /// Worker that rendered the tile last.
     pub(crate) worker: WorkerId,
-    /// Microseconds that it takes that worker.
+    /// Rendering time by that worker, in microseconds.
     pub(crate) us: f64,
 }
 
-/// Which worker each tile belongs to, by the index of its task.
+/// Owner and predicted time of each tile, by the index of its task.
 #[derive(Debug, Default)]
 pub(crate) struct RegionTiles {
     owners: Vec<WorkerId>,

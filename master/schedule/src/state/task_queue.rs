@@ -96,9 +96,9 @@ impl Task {
 /// Whether a result counts.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Verdict {
-    /// It counts: index of the task, and its lease.
+    /// The result counts: index of its task, and the lease that it answers.
     Counts(u32, Lease),
-    /// Late or duplicate.
+    /// The result is late or a duplicate.
     Dead,
 }
 

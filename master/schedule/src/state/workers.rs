@@ -41,12 +41,12 @@ pub(crate) const LANES: u32 = 2;
 pub(crate) struct Worker {
     pub(crate) name: Arc<str>,
     pub(crate) threads: u32,
-    /// Whether it runs on the master's host.
+    /// Whether the worker runs on the master's host.
     pub(crate) is_local: bool,
     pub(crate) since: Micros,
-    /// It drains and takes no more leases.
+    /// The worker drains and takes no more leases.
     pub(crate) leaving: bool,
-    /// It is outside the active set (`policy::active_set`) and takes no leases for now.
+    /// The worker is outside the active set (`policy::active_set`) and takes no leases for now.
     is_spare: bool,
     /// Scenes that were sent to it.
     pub(crate) scenes: BTreeSet<SceneId>,

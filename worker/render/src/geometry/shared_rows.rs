@@ -346,8 +346,8 @@ impl AnyOpen {
 }
 
 impl<S: Tiered, const N: usize> SharedRowsSheets<'_, S, N> {
-    /// What is open, or all if nothing is said of that, where lattice rows reach in `most` sheets
-    /// from `k` on, of which there are no more than slots.
+    /// Returns the open pixels (without a mask all) that lattice rows reach in `most` sheets from
+    /// `k` on; `most` is at most the number of slots, `N`.
     ///
     /// Perspective's windows are below 40 pixels, so a voxel's sections lie less than 20 aside of
     /// its centre. Thus its sheets' first tiers lie less than 2 * 20 /

@@ -119,13 +119,13 @@ pub struct Sifted {
     pub kept: usize,
 }
 
-/// Voxels of a brick on their way to buckets.
+/// Scratch memory of a toss: up to 512 voxels of a brick, one array a property.
 pub struct Tossing {
-    /// Positions and depths.
+    /// Positions x, y in subpixels from the part's corner, and depths in phases.
     at: [[i32; 512]; 3],
-    /// First sheets.
+    /// Numbers of the voxels' first sheets.
     first: [i32; 512],
-    /// Whether they may touch the part or an open pixel, and near which: [`OpenMask::near_all`].
+    /// Whether a voxel may touch the part or an open pixel ([`OpenMask::near_all`]).
     fate: [u32; 512],
     cells: [u32; 512],
     samples: [u32; 512],
@@ -133,7 +133,7 @@ pub struct Tossing {
     locals: [u32; 512],
     /// First pixels of footprints, and where weights begin.
     windows: [[u32; 512]; 4],
-    /// Those that are kept, ready for their buckets.
+    /// Kept voxels, packed for their buckets.
     ready: [Splat; 512],
 }
 

@@ -289,13 +289,14 @@ impl Leaning {
         self.row != 0 || self.most != [0.0; 2]
     }
 
-    /// How far sections lie beside their voxels along an axis, in vox: [`Sections::most`] a phase.
+    /// Distance of sections beside their voxels along an axis, in vox: [`Sections::most`] a phase.
     #[inline(always)]
     pub(crate) fn aside(&self, axis: usize) -> &[f64] {
         &self.aside[axis]
     }
 
-    /// The same in subpixels, where a view is parallel; and [`MOST`] zeros more.
+    /// Distance of sections beside their voxels along an axis, in subpixels; parallel views only.
+    /// [`Sections::most`] a phase, and [`MOST`] zeros at the end.
     #[inline(always)]
     pub(crate) fn subpixels(&self, axis: usize) -> &[i32] {
         &self.subpixels[axis]

@@ -80,7 +80,7 @@ impl LatticeRows {
         Some(lattice_rows)
     }
 
-    /// What there is of each, by the index of a voxel in it.
+    /// Returns `of` for each lattice row in order; `of` takes the index of a voxel in the row.
     fn all<T>(&self, of: impl Fn([u32; 3]) -> T) -> Vec<T> {
         let along = |n| std::array::from_fn(|a| if a == self.axis { n } else { 0 });
         let n = self.eye.len() as u32;

@@ -47,8 +47,8 @@ fn lattice_rows_exist_for_level_views_with_wide_enough_rows() {
 }
 
 proptest! {
-    /// What a voxel's place down the picture says of its lattice row is what its index does, and
-    /// all that reach a part have a tier there.
+    /// A voxel's position down the picture and its index give the same lattice row, and all rows
+    /// that reach a part have a tier there.
     #[test]
     fn lattice_row_from_position_equals_lattice_row_from_index(
         azimuth in 0.0..6.3f64, height in 8.0..110.0f64, upside_down in any::<bool>(),

@@ -54,7 +54,7 @@ pub(crate) enum ResidencyAction {
     Send { set: BrickSetKey, bricks: Vec<BrickId>, bytes: u64, over_budget: bool },
 }
 
-/// Which worker holds which brick, for all sets that are open.
+/// Table of the bricks that each worker holds, for all open sets.
 #[derive(Debug, Default)]
 pub(crate) struct Residency {
     sets: BTreeMap<BrickSetKey, Set>,
@@ -69,7 +69,7 @@ pub(crate) struct Residency {
     on_request: bool,
 }
 
-/// Which worker has which bricks of one set, and which bricks were used lately.
+/// View of one set in [`Residency`]: the bricks that each worker holds, and those used lately.
 pub(crate) struct BrickPresence<'a> {
     key: BrickSetKey,
     needed: &'a [u64],

@@ -408,9 +408,9 @@ pub(super) mod lines {
         first.min(PART as usize - wide)
     }
 
-    /// Which weights in each slot windows have along an axis. These are kilobytes, and a bucket may
-    /// have few voxels: they stay where they are from one to the next, and what is of no voxel at
-    /// hand is anything.
+    /// Spans of weights along an axis: for each slot and voxel the pixels that have a weight. The
+    /// arrays are kilobytes and a bucket may have few voxels, so they are reused from bucket to
+    /// bucket; entries behind the bucket's voxels are stale.
     pub(crate) struct Spans<const N: usize> {
         /// Pixels of a window that have a weight, a bit each.
         present: [Each<u32>; N],
@@ -432,9 +432,10 @@ pub(super) mod lines {
     }
 
     impl<'a, W, const N: usize> Lines<'a, W, N> {
-        /// Those across and down of the voxels in `kept`, which ascend. Windows begin at columns
-        /// that are multiples of `step` and are moved inside to be `wide` columns; they may have
-        /// any number of rows. Columns that are alike are those of the first slot alone.
+        /// Returns the weights across and down of the voxels in `kept`, which ascends. Windows
+        /// begin at columns that are multiples of `step` and are moved inside to be `wide` columns;
+        /// they may have any number of rows. Columns that are alike are those of the first slot
+        /// alone.
         ///
         /// # Safety
         /// For machines with the instructions of `L`.
@@ -456,7 +457,8 @@ pub(super) mod lines {
             }
         }
 
-        /// Those of the first `n` voxels along `axis` in some slots. See [`Lines::both`].
+        /// Returns the weights of the first `n` voxels along `axis` in some slots, under the rules
+        /// of [`Lines::both`].
         #[inline(always)]
         unsafe fn new<L: Lanes, S: Recorded<Weight = W>>(
             apart: &Apart,

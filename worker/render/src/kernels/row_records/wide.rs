@@ -54,8 +54,8 @@ pub(super) trait Wide<S: Recorded> {
     /// `w` for all channels.
     unsafe fn weight(w: S::Weight) -> Self::Down;
 
-    /// What the `at`th register of `lines` and those of the tiers below add up to with these
-    /// weights.
+    /// Returns the sum of register `at` of [`FOUR`] tiers' lines, each times its weight. The lines
+    /// of tiers lie `a_tier` apart.
     unsafe fn down(
         lines: *const Line,
         at: usize,
@@ -63,7 +63,7 @@ pub(super) trait Wide<S: Recorded> {
         weights: &[Self::Down; FOUR],
     ) -> Self::Sums;
 
-    /// The same of any number.
+    /// Returns the sum that [`Self::down`] returns, over as many tiers as there are weights.
     unsafe fn down_all(
         lines: *const Line,
         at: usize,

@@ -15,8 +15,8 @@ use slabcast_common::shade::NO_NORMAL;
 use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
 use slabcast_common::volume::Samples;
 
-/// What is compiled for an instruction set: every function that these call is inlined into
-/// them.
+/// Compiles the two entry points for an instruction set. All functions that they call are inlined
+/// into them.
 macro_rules! compiled {
     ($name:ident, $features:literal, $lanes:ty) => {
         pub(super) mod $name {
@@ -103,9 +103,9 @@ unsafe fn keep<L: Lanes>(tossing: &mut Tossing, n: usize, wanted: u32) -> usize 
     kept
 }
 
-/// Places in lanes.
+/// Positions of a brick's voxels, a register of them at a time.
 pub(super) trait Placed<L: Lanes>: Placing {
-    /// Those of voxels from `local` on.
+    /// Returns x, y (subpixels) and depth (phases) of `L::LANES` voxels from index `local` on.
     ///
     /// # Safety
     /// For machines with the instructions of `L`, as are all functions here.
@@ -215,9 +215,9 @@ unsafe fn make_ready<L: Lanes>(
     }
 }
 
-/// What samples and normals are, widened to 32 bits.
+/// An item of the samples' or normals' arrays that lanes load as 32-bit integers.
 trait Wide: Sized {
-    /// The first ones.
+    /// Loads the first `L::LANES` items.
     unsafe fn load<L: Lanes>(items: &[Self]) -> L::Ints;
 }
 

@@ -75,7 +75,8 @@ unsafe fn fours(weights: &[i16], begins: &Begins, behind: usize) -> [__m256i; PA
     }
 }
 
-/// The same of floats: two slots a register, one behind the other.
+/// Loads four float weights of each slot, from `behind` after the slot's first: two slots a
+/// register, one behind the other.
 ///
 /// # Safety
 /// As there.

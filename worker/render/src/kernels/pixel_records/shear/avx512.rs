@@ -31,7 +31,8 @@ unsafe fn fours(weights: &[i16], begins: &Begins, behind: usize) -> [__m512i; 2]
     }
 }
 
-/// The same of floats: two slots a register.
+/// Loads eight float weights of each slot, from `behind` after the slot's first: two slots a
+/// register.
 ///
 /// # Safety
 /// As there.

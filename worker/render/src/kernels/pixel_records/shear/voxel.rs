@@ -238,8 +238,8 @@ unsafe fn places(slant: &Slant<'_>, apart: &Apart, i: usize, axis: usize) -> __m
     }
 }
 
-/// Which of some `sheets` behind its first voxel `i` does not reach: the greatest number, and the
-/// least where it does.
+/// Compares `sheets`, counted from voxel `i`'s first, with the sheets that it reaches: `i32::MIN`
+/// in lanes of sheets that it reaches, `i32::MAX` in the others.
 #[inline(always)]
 unsafe fn none(apart: &Apart, i: usize, sheets: __m256i) -> __m256i {
     // SAFETY: the caller has the instructions.

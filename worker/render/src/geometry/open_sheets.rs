@@ -56,7 +56,7 @@ impl<S: Recorded> SharedRowsStore<S> {
 pub struct Closes<S: Recorded> {
     /// Sums of the sheet before, where it was touched; elsewhere anything.
     before: Vec<S::Pixel>,
-    /// Pixels of `before` that are the sheet's before.
+    /// Pixels of `before` that the sheet in front has sums of, a bit each.
     was: Rows,
     places: Places,
     sifting: Sifting,
@@ -373,7 +373,8 @@ impl<S: Recorded> Closes<S> {
         self.sifting = Sifting::default();
     }
 
-    /// [`Open::before`].
+    /// Returns the sums of the closed sheet in front by pixel, and the pixels that have any, a bit
+    /// each ([`Open::before`]).
     #[inline(always)]
     pub(crate) fn before(&mut self) -> (&mut [S::Pixel], &mut Rows) {
         (&mut self.before, &mut self.was)

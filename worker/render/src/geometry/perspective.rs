@@ -251,7 +251,8 @@ impl<'a, S: Recorded, const N: usize> Footprints<'a, S, N> {
 const DRAWN: &str = "no sheet of the part is clipped";
 
 impl<S: Recorded, const N: usize> Drawing<'_, S, N> {
-    /// [`Stage::toss`].
+    /// Tests brick `which` of the part, then its voxels, and tosses the rest into buckets
+    /// ([`Stage::toss`]).
     #[inline(always)]
     fn toss_all(
         &mut self,

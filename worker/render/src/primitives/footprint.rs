@@ -225,7 +225,7 @@ pub struct Leaning {
     aside: [Vec<f64>; 2],
     /// Offsets in subpixels, in orthographic views.
     subpixels: [Vec<i32>; 2],
-    /// [`Lean::row_fixed`].
+    /// Slope of the kernel's rows, vox per vox in units of 2^-16 ([`Lean::row_fixed`]).
     row: i64,
     /// The farthest that any section lies aside.
     most: [f64; 2],

@@ -257,7 +257,7 @@ pub(super) mod avx2 {
         }
     }
 
-    /// [`sheet_offsets::splat_apart`].
+    /// [`sheet_offsets::splat_apart`] into 32-bit sums with AVX2.
     #[target_feature(enable = "avx2")]
     pub(in super::super) fn splat_apart<const N: usize>(
         simd: Simd,
@@ -544,7 +544,7 @@ pub(super) mod avx512 {
         }
     }
 
-    /// [`sheet_offsets::splat_apart`].
+    /// [`sheet_offsets::splat_apart`] into 32-bit sums with AVX-512.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     pub(in super::super) fn splat_apart<const N: usize>(
         simd: Simd,

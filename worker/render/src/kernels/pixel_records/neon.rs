@@ -324,7 +324,7 @@ type At<'a, S, const N: usize> = (
     &'a Tables<'a, S>,
 );
 
-/// [`Recorded::splat_all`].
+/// [`Recorded::splat_all`] with NEON.
 #[target_feature(enable = "neon")]
 pub(super) fn splat_all<S: InLanes, const N: usize>(
     records: &mut [Record<S, N>],
@@ -384,7 +384,7 @@ fn all<const WIDE: usize, S: InLanes, const N: usize>(
     }
 }
 
-/// [`Recorded::splat_deep`].
+/// [`Recorded::splat_deep`] with NEON.
 #[target_feature(enable = "neon")]
 pub(super) fn splat_deep<S: InLanes, const N: usize>(
     records: &mut [Record<S, N>],
@@ -429,7 +429,7 @@ unsafe fn weave_some<S: InLanes, const N: usize>(
     }
 }
 
-/// [`Recorded::weave`].
+/// [`Recorded::weave`] with NEON.
 #[target_feature(enable = "neon")]
 pub(super) fn weave<S: InLanes, const N: usize>(
     rows: [RowAt<'_, S::Weight>; N],
@@ -453,7 +453,7 @@ pub(super) fn weave<S: InLanes, const N: usize>(
     }
 }
 
-/// [`Recorded::splat_apart`].
+/// [`Recorded::splat_apart`] with NEON.
 #[target_feature(enable = "neon")]
 pub(super) fn splat_apart<S: InLanes, const N: usize>(
     simd: Simd,

@@ -261,7 +261,7 @@ pub(super) mod avx2 {
         }
     }
 
-    /// [`sheet_offsets::splat_apart`].
+    /// [`sheet_offsets::splat_apart`] into 16-bit sums with AVX2.
     #[target_feature(enable = "avx2")]
     pub(in super::super) fn splat_apart<const N: usize>(
         simd: Simd,
@@ -600,7 +600,7 @@ pub(super) mod avx512 {
         }
     }
 
-    /// [`sheet_offsets::splat_apart`].
+    /// [`sheet_offsets::splat_apart`] into 16-bit sums with AVX-512.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     pub(in super::super) fn splat_apart<const N: usize>(
         simd: Simd,

@@ -102,7 +102,7 @@ pub(super) trait Pixels: Copy {
 /// Compiles the loops for some instructions.
 macro_rules! compiled {
     ($features:literal) => {
-        /// [`super::wide::add_flat`].
+        /// [`super::wide::add_flat`] in lanes.
         #[target_feature(enable = $features)]
         pub(super) fn add_flat<W: Wide<S>, S: Recorded, const N: usize>(
             tiers: &mut Tiers<'_, S, N>,
@@ -114,7 +114,7 @@ macro_rules! compiled {
             unsafe { super::wide::add_flat::<W, S, N>(tiers, voxels, slot, weights) }
         }
 
-        /// [`super::wide::add_apart`].
+        /// [`super::wide::add_apart`] in lanes.
         #[target_feature(enable = $features)]
         pub(super) fn add_apart<W: Wide<S>, S: Recorded, const N: usize>(
             tiers: &mut Tiers<'_, S, N>,
@@ -126,7 +126,7 @@ macro_rules! compiled {
             unsafe { super::wide::add_apart::<W, S, N>(tiers, voxels, places, layers) }
         }
 
-        /// [`super::wide::fold`].
+        /// [`super::wide::fold`] in lanes.
         #[target_feature(enable = $features)]
         pub(super) fn fold<W: Wide<S>, S: Recorded, const N: usize>(
             tiers: &Tiers<'_, S, N>,
@@ -171,7 +171,7 @@ fn registers<W: Wide<S>, S: Recorded, const N: usize>(tiers: &Tiers<'_, S, N>) -
     [W::OF_LINE * wide, W::OF_LINE * rows * wide]
 }
 
-/// [`super::Tiered::add_flat`].
+/// [`super::Tiered::add_flat`] in lanes.
 ///
 /// # Safety
 /// For machines with the instructions of `W`.
@@ -230,7 +230,7 @@ unsafe fn flat<const GROUPS: usize, W: Wide<S>, S: Recorded, const N: usize>(
     }
 }
 
-/// [`super::Tiered::add_apart`].
+/// [`super::Tiered::add_apart`] in lanes.
 ///
 /// # Safety
 /// For machines with the instructions of `W`.
@@ -312,7 +312,7 @@ unsafe fn section<const GROUPS: usize, W: Wide<S>, S: Recorded, const N: usize>(
     }
 }
 
-/// [`super::Tiered::fold`].
+/// [`super::Tiered::fold`] in lanes.
 ///
 /// # Safety
 /// For machines with the instructions of `W`.

@@ -2,7 +2,7 @@
 
 use std::arch::x86_64::*;
 
-/// [`super::any_in_rows`].
+/// [`super::any_in_rows`] with AVX2.
 #[target_feature(enable = "avx2")]
 #[inline]
 pub(super) fn any_in_rows(rows: &[u64; 64], [begin, end]: [usize; 2], columns: u64) -> bool {

@@ -63,7 +63,7 @@ fn deep(places: &DeepBrick<'_>, local: usize) -> [__m512i; 3] {
     [round(across), round(down), round(deep)]
 }
 
-/// [`super::any_in_rows`].
+/// [`super::any_in_rows`] with AVX-512.
 #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
 #[inline]
 pub(super) fn any_in_rows(rows: &[u64; 64], [begin, end]: [usize; 2], columns: u64) -> bool {

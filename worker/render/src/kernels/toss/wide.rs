@@ -22,7 +22,7 @@ macro_rules! compiled {
         pub(super) mod $name {
             use super::*;
 
-            /// [`Sieve::sift_plain`].
+            /// [`Sieve::sift_plain`] in lanes.
             #[target_feature(enable = $features)]
             pub(in super::super) fn sift<P: Placed<$lanes>>(
                 sieve: &Sieve<'_, P>,
@@ -39,7 +39,7 @@ macro_rules! compiled {
                 }
             }
 
-            /// [`super::super::make_ready`].
+            /// [`super::super::make_ready`] in lanes.
             #[target_feature(enable = $features)]
             pub(in super::super) fn make_ready(
                 sections: &Sections,
@@ -143,7 +143,7 @@ unsafe fn first<L: Lanes>(phases: &Phases, at: L::Ints) -> (L::Ints, L::Ints) {
     }
 }
 
-/// [`super::move_inside`].
+/// [`super::move_inside`] in lanes.
 #[inline(always)]
 unsafe fn move_inside<L: Lanes>(phases: &Phases, at: L::Ints) -> (L::Ints, L::Ints) {
     let len = phases.len as i32;
@@ -168,7 +168,7 @@ unsafe fn in_tier<L: Lanes>(phases: &Phases, shape: &Shape, at: L::Ints) -> (L::
     }
 }
 
-/// [`TierOf::at`].
+/// [`TierOf::at`] in lanes.
 #[inline(always)]
 unsafe fn tier_at<L: Lanes>(tier: &TierOf, rows: usize, y: L::Ints) -> L::Ints {
     // SAFETY: the caller's.

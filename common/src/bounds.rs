@@ -2,7 +2,7 @@
 //! the integers cost, at most, on any pixel.
 //!
 //! Each is a bound, argued below, not an estimate. Bounds are in a frame's statistics, and
-//! `slabcast check` holds pictures against them. All are in 1/255. `within` is the box of the
+//! `slabcast lab check` holds pictures against them. All are in 1/255. `within` is the box of the
 //! visible voxels.
 
 use crate::brick::TightBox;

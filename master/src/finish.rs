@@ -162,7 +162,7 @@ fn error(
 }
 
 /// Lists what the frame did not need, by name, with the bytes that it saved. Milliseconds are not
-/// measured in passing: `slabcast explain` draws with and without.
+/// measured in passing: `slabcast lab explain` draws with and without.
 ///
 /// Bytes of bricks are those of one copy; the master and each worker that needs them save one.
 fn left_out(

@@ -233,7 +233,7 @@ fn colours(text: &str) -> Result<Vec<[f64; 4]>, Fail> {
     let json = read_json(path)?;
     if !paraview::looks_like_paraview(&json) {
         return Err(Fail::failed(format!(
-            "{}: is no colour map of ParaView; a transfer function goes with --tf",
+            "{}: is not a colour map of ParaView; a transfer function goes with --tf",
             path.display()
         )));
     }
@@ -255,7 +255,7 @@ pub fn read_json(path: &Path) -> Result<String, Fail> {
     file.take(MAX_JSON_BYTES + 1).read_to_end(&mut bytes).map_err(|e| fail(&e))?;
     if bytes.len() as u64 > MAX_JSON_BYTES {
         return Err(Fail::failed(format!(
-            "{}: has more than {} MB, which is no view path or transfer function",
+            "{}: has more than {} MB, too many for a view path or a transfer function",
             path.display(),
             MAX_JSON_BYTES / 1_000_000
         )));

@@ -18,7 +18,7 @@ impl Trace {
     /// Reads a trace from the bytes of a JSON file.
     ///
     /// # Errors
-    /// [`TraceError`] if the file is no trace, if it is one of another format or of pixels of
+    /// [`TraceError`] if the file is not a trace, if it is one of another format or of pixels of
     /// another version, and if a value is out of range: it names the field.
     pub fn from_json(bytes: &[u8]) -> Result<Trace, TraceError> {
         let no = |why: String| Err(TraceError(why));
@@ -33,7 +33,9 @@ impl Trace {
             Err(e) => match serde_json::from_slice::<Versioned>(bytes) {
                 Ok(Versioned { version }) if version != VERSION => return other(version),
                 _ => {
-                    return no(format!("is no trace: {e}; give a file of `slabcast plan --trace`"));
+                    return no(format!(
+                        "is not a trace: {e}; give a file of `slabcast lab plan --trace`"
+                    ));
                 }
             },
         };
@@ -49,7 +51,7 @@ impl Trace {
         }
         let [w, h] = trace.about.size;
         if !(1..=8192).contains(&w) || !(1..=8192).contains(&h) {
-            return no(format!("about.size: {w}x{h} is no size of a picture"));
+            return no(format!("about.size: {w}x{h} is not a size of a picture"));
         }
         let pings = trace.about.pings.iter().flat_map(|p| [p.alone_ns, p.company_ns]).flatten();
         if pings.max() > Some(1_000_000_000) {
@@ -84,7 +86,7 @@ impl Trace {
                     slab.levels.iter().find(|l| !matches!(l.edge, 16 | 32 | 64 | 128 | 256));
                 if let Some(level) = level {
                     return no(format!(
-                        "frames[{i}].slabs[{s}]: {} is no edge of a macrotile",
+                        "frames[{i}].slabs[{s}]: {} is not an edge of a macrotile",
                         level.edge
                     ));
                 }

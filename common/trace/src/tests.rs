@@ -90,7 +90,7 @@ fn shut_pixels_survive_run_length_coding() {
 fn unusable_trace_files_are_refused_with_the_field() {
     let says = |text: &str| Trace::from_json(text.as_bytes()).unwrap_err().to_string();
     let good = trace().to_json();
-    assert!(says("{}").contains("slabcast plan --trace"));
+    assert!(says("{}").contains("slabcast lab plan --trace"));
     assert!(says(&good.replacen("\"version\":6", "\"version\":7", 1)).contains("version 7"));
     let old = good.replace("\"version\":6", "\"version\":3").replace(",[2,1,68]]", "]");
     assert!(old.len() < good.len() && says(&old).contains("version 3"), "{old}");
@@ -101,7 +101,7 @@ fn unusable_trace_files_are_refused_with_the_field() {
         says(&good.replace("\"pack_ns\":1.5", "\"pack_ns\":-1.5")).starts_with("about.packing")
     );
     assert!(says(&good.replace("[100,70]", "[10,7]")).contains("more pixels"));
-    assert!(says(&good.replace("\"edge\":64", "\"edge\":65")).contains("65 is no edge"));
+    assert!(says(&good.replace("\"edge\":64", "\"edge\":65")).contains("65 is not an edge"));
     assert!(says(&good.replace("[64,0,700", "[64,99,700")).contains("by row and column"));
     assert!(says(&good.replace("[0,250,40]", "[0,250]")).contains("when it is needed"));
     let pixels = format!("\"pixels_version\":{}", slabcast_common::PIXELS_VERSION);

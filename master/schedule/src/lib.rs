@@ -79,8 +79,8 @@ pub struct Config {
     pub queue_ahead: u32,
     /// Cuts mixed tile sizes under the `slab` schedule: each render thread starts with a whole
     /// macrotile, later ones are quarters ([`macrotile::cut_mixed`]). The paper's experiment, which
-    /// `slabcast study` repeats by simulation (`slabcast-sim`). No master sets it, and records do
-    /// not have it.
+    /// `slabcast lab study` repeats by simulation (`slabcast-sim`). No master sets it, and records
+    /// do not have it.
     pub mixed: bool,
 }
 

@@ -1,6 +1,6 @@
 //! Time of the scheduler's own decisions, measured by hand: many workers draw a ball.
 //!
-//! `slabcast plan` measures the same on a path that was drawn; here nothing has to be.
+//! `slabcast lab plan` measures the same on a path that was drawn; here nothing has to be.
 
 use slabcast_common::brick::{BRICK_EDGE, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId};
@@ -128,7 +128,7 @@ impl Observer for Wall {
     }
 }
 
-/// About what `slabcast plan` measures.
+/// About what `slabcast lab plan` measures.
 fn costs() -> Costs {
     let each = |per_unit_ns| LinearCost { fixed_ns: 800.0, per_unit_ns };
     let messages = |wake_ns| MessageCosts {

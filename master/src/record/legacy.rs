@@ -20,8 +20,8 @@ struct OldScene {
 /// Says which field is wrong.
 pub(super) fn scene(bytes: &[u8]) -> Result<SceneSpec, String> {
     use prost::Message;
-    let mut scene = wire::Scene::decode(bytes).map_err(|e| format!("is no scene: {e}"))?;
-    let old = OldScene::decode(bytes).map_err(|e| format!("is no scene: {e}"))?;
+    let mut scene = wire::Scene::decode(bytes).map_err(|e| format!("is not a scene: {e}"))?;
+    let old = OldScene::decode(bytes).map_err(|e| format!("is not a scene: {e}"))?;
     let old = scene.transfer.is_none().then_some(old.transfer_json);
     if old.is_some() {
         // Any good one, so that all else is checked; the scene's own takes its place below.

@@ -29,7 +29,7 @@ use std::sync::Arc;
 /// 0.9 GB. A longer line is of no record.
 const MAX_LINE_BYTES: u64 = 1 << 30;
 
-/// Error of a file that is no record, or a damaged one.
+/// Error of a file that is not a record, or a damaged one.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}: {problem}")]
 pub struct RecordError {
@@ -119,7 +119,8 @@ impl<R: BufRead> Reader<R> {
             }
             Err(e) => {
                 let (said, _) = split_place(&e.to_string());
-                Err(self.broken(format!("is no line of a record: {said}, column {}", e.column())))
+                Err(self
+                    .broken(format!("is not a line of a record: {said}, column {}", e.column())))
             }
         }
     }

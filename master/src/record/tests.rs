@@ -377,7 +377,7 @@ fn replay_names_the_line_of_a_broken_file() {
     assert!(says(b"{\"out\":[]}\n").starts_with("line 1: is not"));
     let any = |l: &str| l.starts_with("{\"event\"");
     let (line, bad) = tampered(&bytes, any, |_| "{\"event\":5}".into());
-    assert!(says(&bad).starts_with(&format!("line {line}: is no line of a record")));
+    assert!(says(&bad).starts_with(&format!("line {line}: is not a line of a record")));
     let head = |l: &str| l.starts_with("{\"record\"");
     let (_, bad) = tampered(&bytes, head, |l| l.replace("\"version\":4", "\"version\":7"));
     assert!(says(&bad).contains("version 7"), "{}", says(&bad));

@@ -40,7 +40,7 @@ pub(crate) fn open(text: &str) -> Result<Volume, Problem> {
             None => {
                 return Err(Problem::malformed(
                     "size",
-                    format!("{} is no size of `{name}`", quoted(size)),
+                    format!("{} is not a size of `{name}`", quoted(size)),
                     format!(
                         "give N or AxBxC, at most 16384 along an axis and {SAMPLES_MAX} samples \
                          (`one` has one size)"

@@ -286,7 +286,7 @@ fn describe(head: &[u8], name: &str) -> String {
     } else if head.iter().take(512).all(|b| b.is_ascii_graphic() || b.is_ascii_whitespace()) {
         "is text, not a volume"
     } else {
-        "is no volume that we know"
+        "is not a volume that we know"
     };
     what.to_string()
 }

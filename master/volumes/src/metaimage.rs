@@ -145,7 +145,7 @@ fn layout(fields: &Fields) -> Result<Layout, Problem> {
     if let Some((key, value)) = fields.get(&["ObjectType"])
         && !value.eq_ignore_ascii_case("image")
     {
-        return Err(fields.bad(key, "is no image", "give a MetaImage of ObjectType Image"));
+        return Err(fields.bad(key, "is not an image", "give a MetaImage of ObjectType Image"));
     }
     let axes = fields.required("NDims", "3")?;
     if axes.parse() != Ok(3u32) {
@@ -154,7 +154,11 @@ fn layout(fields: &Fields) -> Result<Layout, Problem> {
     if let Some((key, value)) = fields.get(&["ElementNumberOfChannels"])
         && value.parse() != Ok(1u32)
     {
-        return Err(fields.bad(key, "is not 1: a voxel is no single number", "save one channel"));
+        return Err(fields.bad(
+            key,
+            "is not 1: a voxel is not a single number",
+            "save one channel",
+        ));
     }
     let number = match fields.required("ElementType", "MET_SHORT")?.to_ascii_uppercase().as_str() {
         "MET_CHAR" => Number::I8,
@@ -171,7 +175,7 @@ fn layout(fields: &Fields) -> Result<Layout, Problem> {
         _ => {
             return Err(fields.bad(
                 "ElementType",
-                "is no type of one number",
+                "is not a type of one number",
                 "give one such as MET_UCHAR, MET_SHORT, MET_USHORT or MET_FLOAT",
             ));
         }
@@ -211,7 +215,7 @@ fn storage(fields: &Fields) -> Result<Storage, Problem> {
         None => Skip::Bytes(0),
         Some((_, "-1")) if encoding == Encoding::Raw => Skip::FromEnd,
         Some((key, value)) => Skip::Bytes(value.parse().map_err(|_| {
-            fields.bad(key, "is no number of bytes", "give -1 (raw data alone), 0 or more")
+            fields.bad(key, "is not a number of bytes", "give -1 (raw data alone), 0 or more")
         })?),
     };
     Ok(Storage { encoding, line_skip: 0, byte_skip, skip_field: "HeaderSize" })

@@ -212,7 +212,7 @@ impl Header {
                     128 => "RGB colours",
                     2304 => "RGBA colours",
                     1536 => "128-bit floats",
-                    _ => "no type of the NIfTI format",
+                    _ => "not a type of the NIfTI format",
                 };
                 return Err(Problem::unsupported(
                     "datatype",
@@ -253,7 +253,7 @@ impl Header {
         if !(first..=first + SKIP_MAX_BYTES as f64).contains(&offset) || offset.fract() != 0.0 {
             return Err(Problem::malformed(
                 "vox_offset",
-                format!("{offset:?} is no place between {first} and 16 MiB behind it"),
+                format!("{offset:?} is not a position between {first} and 16 MiB behind it"),
                 "correct it (352 where there are no extensions)",
             ));
         }

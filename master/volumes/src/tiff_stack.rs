@@ -208,7 +208,7 @@ impl TiffFile {
             other => {
                 return Err(Problem::unsupported(
                     "PhotometricInterpretation",
-                    format!("{other:?} is no grey picture"),
+                    format!("{other:?} is not a grey picture"),
                     "save it in shades of grey, one number a pixel",
                 ));
             }

@@ -147,7 +147,7 @@ impl Text<'_> {
         read.ok_or_else(|| {
             damaged(
                 format!(
-                    "number {} is {}, which is no {}",
+                    "number {} is {}, which is not a value of {}",
                     self.seen,
                     quoted(&String::from_utf8_lossy(&self.word)),
                     self.number.name()
@@ -211,7 +211,7 @@ impl Read for Hex<'_> {
                     b => {
                         let shown = quoted(&String::from_utf8_lossy(&[b]));
                         return Err(damaged(
-                            format!("{shown} is no hexadecimal digit"),
+                            format!("{shown} is not a hexadecimal digit"),
                             "correct the data, or the encoding",
                         ));
                     }

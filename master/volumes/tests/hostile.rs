@@ -37,7 +37,7 @@ fn files_that_are_no_volume_are_refused_with_kind_and_reason() {
         (file("a.nrrd", b"hello"), NotAVolume, "does not begin with `NRRD`"),
         (file("a.nii", b"hello"), NotAVolume, "does not begin with a NIfTI header"),
         (file("a.txt", b"some words\n"), NotAVolume, "is text"),
-        (file("a.xyz", &[0xee; 99]), NotAVolume, "is no volume that we know"),
+        (file("a.xyz", &[0xee; 99]), NotAVolume, "is not a volume that we know"),
         (file("a.bin", &[0xee; 99]), NotAVolume, "is raw numbers without a header"),
         (file("a.gz", &[0x1f, 0x8b]), NotAVolume, "is gzip, but not NIfTI"),
         (file("b.nrrd", b"NRRD0004\n"), Malformed, "type: is missing"),

@@ -63,7 +63,7 @@ impl File {
                     || format!("sections are {}", LAYERED.map(|n| format!("[{n}]")).join(", ")),
                     |n| format!("did you mean [{n}]?"),
                 );
-                return Err(Fail::failed(format!("{shown}: {section}: is no section; {hint}")));
+                return Err(Fail::failed(format!("{shown}: {section}: is not a section; {hint}")));
             }
             let toml::Value::Table(values) = values else {
                 return Err(Fail::failed(format!(
@@ -78,7 +78,7 @@ impl File {
                         Some(near) => format!("did you mean `{near}`?"),
                         None => format!("`slabcast config show {section}` lists all"),
                     };
-                    return Err(Fail::failed(format!("{name}: is no key; {hint}")));
+                    return Err(Fail::failed(format!("{name}: is not a key; {hint}")));
                 }
                 if scalar(value).is_none() {
                     return Err(Fail::failed(format!(

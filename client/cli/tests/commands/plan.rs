@@ -80,7 +80,7 @@ fn plan_separates_measured_from_predicted() {
     std::fs::write(dir.join("bad.trace"), "{}").unwrap();
     let out = run(dir, &[&SMALL[..], &["--trace", "bad.trace"]].concat());
     assert_eq!(out.status.code(), Some(1));
-    assert!(text(&out.stderr).contains("bad.trace: is no trace"), "{}", text(&out.stderr));
+    assert!(text(&out.stderr).contains("bad.trace: is not a trace"), "{}", text(&out.stderr));
 }
 
 #[test]

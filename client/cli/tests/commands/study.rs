@@ -75,7 +75,7 @@ fn study_tables_and_charts_agree() {
     }
     let study: Value =
         serde_json::from_str(&std::fs::read_to_string(out.join("study.json")).unwrap()).unwrap();
-    let n = |v: &Value| v.as_f64().unwrap_or_else(|| panic!("{v} is no number"));
+    let n = |v: &Value| v.as_f64().unwrap_or_else(|| panic!("{v} is not a number"));
     assert_eq!(study["complete"], true);
     assert_eq!(study["views"], 3);
     let runs = study["runs"].as_array().unwrap();

@@ -287,7 +287,7 @@ impl Output {
             && !fits(ends)
         {
             return Err(Fail::usage(format!(
-                "--format, -o: {shown} is no name for {name}; end it in .{}",
+                "--format, -o: {shown} is not a name for {name}; end it in .{}",
                 format.extension()
             )));
         }

@@ -165,7 +165,7 @@ impl Provenance {
         let fits = |edge: u32| edge.checked_mul(p.magnify).is_some_and(|n| n <= MAX_EDGE);
         if p.magnify == 0 || !p.path.size.into_iter().all(fits) {
             return Err(Fail::failed(format!(
-                "{file}: magnify: {} times {}x{} is no size of a picture; the file is damaged",
+                "{file}: magnify: {} times {}x{} is not a size of a picture; the file is damaged",
                 p.magnify, p.path.size[0], p.path.size[1]
             )));
         }

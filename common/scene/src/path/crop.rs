@@ -117,7 +117,7 @@ impl std::str::FromStr for Crop {
     fn from_str(text: &str) -> Result<Crop, String> {
         let bad = || {
             format!(
-                "`{text}` is no box; give FROM:TO for x, y and z, as in -40:40,:,0: (mm) or \
+                "`{text}` is not a box; give FROM:TO for x, y and z, as in -40:40,:,0: (mm) or \
                  50%:,:,:90% (shares); an empty end does not crop"
             )
         };

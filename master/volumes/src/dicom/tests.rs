@@ -244,7 +244,10 @@ fn dicom_errors_name_file_field_and_remedy() {
     }
     let dir = folder(&[("1", swap(good(0.0), "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.9"))]);
     let e = crate::open(dir.path()).unwrap_err().to_string();
-    assert!(e.contains("`1.2.840.10008.1.2.9` is no encoding that is known; convert it"), "{e}");
+    assert!(
+        e.contains("`1.2.840.10008.1.2.9` is not an encoding that is known; convert it"),
+        "{e}"
+    );
     let dir = folder(&[("1", with(0.0, "frames", "30"))]);
     let e = crate::open(dir.path()).unwrap_err().to_string();
     assert!(e.contains("`1` NumberOfFrames: is above 1"), "{e}");

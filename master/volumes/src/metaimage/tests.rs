@@ -68,13 +68,13 @@ fn metaimage_errors_name_field_and_remedy() {
     let with = |from: &str, to: &str| format!("{HEAD}ElementDataFile = LOCAL\n").replace(from, to);
     for (header, say) in [
         (HEAD.to_string(), "line 5: `\\0\\0\\0\\0\\0\\0` is not `Key = Value`"),
-        (with("Image", "Tube"), "ObjectType (line 1): `Tube` is no image"),
+        (with("Image", "Tube"), "ObjectType (line 1): `Tube` is not an image"),
         (with("NDims = 3", "NDims = 4"), "NDims (line 2): `4` is not 3"),
         (with("DimSize = 3 2 1\n", ""), "DimSize: is missing"),
         (with("3 2 1", "3 2"), "`3 2` is not three whole numbers"),
         (with("3 2 1", "3 0 1"), "3 x 0 x 1 has no samples"),
         (with("3 2 1", "3 2 -1"), "is not three whole numbers"),
-        (with("MET_UCHAR", "MET_STRING"), "ElementType (line 4): `MET_STRING` is no type"),
+        (with("MET_UCHAR", "MET_STRING"), "ElementType (line 4): `MET_STRING` is not a type"),
         (with("ElementDataFile", "CompressedData = Maybe\nElementDataFile"), "give True or False"),
         (with("ElementDataFile", "ElementSpacing = 1 1\nElementDataFile"), "is not 3 numbers"),
         (
@@ -90,7 +90,7 @@ fn metaimage_errors_name_field_and_remedy() {
             "save one channel",
         ),
         (with("ElementDataFile", "NDims = 3\nElementDataFile"), "was given in line 2 already"),
-        (with("ElementDataFile", "HeaderSize = x\nElementDataFile"), "is no number of bytes"),
+        (with("ElementDataFile", "HeaderSize = x\nElementDataFile"), "is not a number of bytes"),
         (with("LOCAL", "no.raw"), "ElementDataFile: `no.raw` is not there"),
         (with("LOCAL", "../x.raw"), "ElementDataFile"),
         (with("LOCAL", "LIST\na\nb"), "names 3 files where DimSize wants 1"),

@@ -197,7 +197,7 @@ fn nifti_errors_name_field_and_remedy() {
     for (at, with, say) in [
         (70, &[128, 0][..], "datatype: 128 is RGB colours; convert"),
         (70, &[32, 0], "datatype: 32 is complex"),
-        (70, &[3, 0], "datatype: 3 is no type"),
+        (70, &[3, 0], "datatype: 3 is not a type"),
         (344, b"ni1", "magic: is the header of a pair"),
         (344, b"\0\0\0", "magic: is `\\0\\0\\0\\0`, so this is ANALYZE"),
         (40, &[2, 0], "dim[0]: is 2"),

@@ -155,7 +155,7 @@ fn nrrd_encodings_give_the_same_samples() {
     for (name, bytes, say) in [
         ("ascii", &b"1 2 3 4 5"[..], "6 bytes are needed and 5 are there"),
         ("ascii", b"1 2 3 4 5 6 7", "goes on after the 6 bytes"),
-        ("ascii", b"1 2 3 4 5 256", "number 6 is `256`, which is no uint8"),
+        ("ascii", b"1 2 3 4 5 256", "number 6 is `256`, which is not a value of uint8"),
         ("hex", b"00112233445", "a byte has one hexadecimal digit"),
         ("hex", b"0011223344556677", "goes on after the 6 bytes"),
     ] {
@@ -216,7 +216,7 @@ fn nrrd_errors_name_field_and_remedy() {
         (with("raw", "zrl"), "encoding (line 5): zrl is not read; save"),
         (with("raw", "bzip2"), "data: the bzip2 stream is damaged after 0 of 6 bytes"),
         (with("raw", "txt"), "data: number 1 is `"),
-        (with("raw", "hex"), "is no hexadecimal digit"),
+        (with("raw", "hex"), "is not a hexadecimal digit"),
         (with("raw", "zip"), "`zip` is not an encoding"),
         (with("uint8", "block"), "type (line 2): `block` samples are not numbers"),
         (with("uint8", "char8"), "`char8` is not a type"),

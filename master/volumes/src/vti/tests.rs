@@ -136,7 +136,7 @@ fn vti_errors_name_field_and_remedy() {
         (with("UInt8\" Name=\"v", "String\" Name=\"v"), "DataArray type: `String`"),
         (with("Scalars=\"v\"", "Scalars=\"other\""), "`other`: has several numbers a point"),
         (with("Scalars=\"v\"", "Scalars=\"none\""), "DataArray: there is none with one number"),
-        (with("29<", "299<"), "number 30 is `299`, which is no uint8"),
+        (with("29<", "299<"), "number 30 is `299`, which is not a value of uint8"),
         (with("28 29<", "28<"), "`v` data: truncated: 30 bytes are needed and 29"),
         (with("29<", "29 30<"), "goes on after the 30 bytes"),
         (with("format='ascii'", "format='zip'"), "format: `zip`"),

@@ -65,7 +65,7 @@ pub(super) fn time_from_wire(field: &str, time: Option<Timestamp>) -> Result<i64
     let ms = seconds.checked_mul(1000).and_then(|ms| ms.checked_add(i64::from(nanos / 1_000_000)));
     match ms {
         Some(ms) if (0..1_000_000_000).contains(&nanos) => Ok(ms),
-        _ => Err(WireError::value(field, "is no time")),
+        _ => Err(WireError::value(field, "is not a time")),
     }
 }
 
@@ -80,7 +80,7 @@ fn duration_from_wire(field: &str, duration: Option<WireDuration>) -> Result<Dur
     let WireDuration { seconds, nanos } = duration.unwrap_or_default();
     match (u64::try_from(seconds), u32::try_from(nanos)) {
         (Ok(seconds), Ok(nanos)) if nanos < 1_000_000_000 => Ok(Duration::new(seconds, nanos)),
-        _ => Err(WireError::value(field, "is no duration from 0")),
+        _ => Err(WireError::value(field, "is not a duration of 0 or more")),
     }
 }
 
@@ -146,7 +146,7 @@ pub fn worker_to_wire(worker: &Worker) -> wire::Worker {
 pub fn worker_from_wire(worker: wire::Worker) -> Result<Worker, WireError> {
     let id = worker.worker_id.strip_prefix('w').and_then(|n| n.parse().ok());
     Ok(Worker {
-        id: WorkerId(id.ok_or_else(|| WireError::value("worker_id", "is no id of a worker"))?),
+        id: WorkerId(id.ok_or_else(|| WireError::value("worker_id", "is not the id of a worker"))?),
         name: name_from_wire("name", worker.name)?,
         address: optional_name_from_wire("address", worker.address)?,
         threads: worker.threads,

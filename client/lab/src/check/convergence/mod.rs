@@ -73,7 +73,7 @@ const FORMULA_SIZE: [u32; 2] = [96, 96];
 pub(crate) fn run(args: &ConvergenceArgs) -> Result<(), Fail> {
     if !args.thinnest.is_power_of_two() {
         return Err(Fail::usage(format!(
-            "--thinnest: {} is no power of two; give 1, 2, 4, 8, 16, 32 or 64",
+            "--thinnest: {} is not a power of two; give 1, 2, 4, 8, 16, 32 or 64",
             args.thinnest
         )));
     }

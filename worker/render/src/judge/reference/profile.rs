@@ -7,7 +7,7 @@ use std::sync::Arc;
 /// most 2e-11 of the peak and 1e-7 of what is there (a test keeps it), a thousandth of what
 /// the tolerance of the integration lets through; half as many miss by 16 times as much. At this
 /// many, three axes take 26 KB and stay in the first cache. With exponentials in their place
-/// `slabcast error` took a quarter longer (mri256, peer-semi, perspective; processor seconds).
+/// `slabcast lab error` took a quarter longer (mri256, peer-semi, perspective; processor seconds).
 const NODES_PER_STD: f64 = 160.0;
 
 /// Kernel along one axis, in f64, tabulated from its middle to its radius.

@@ -40,7 +40,10 @@ fn recorded_render_replays_identically() {
     let out = run(dir, &["lab", "replay", "broken.log"]);
     assert_eq!(out.status.code(), Some(1));
     let said = text(&out.stderr);
-    assert!(said.contains("broken.log: line ") && said.contains("no line of a record"), "{said}");
+    assert!(
+        said.contains("broken.log: line ") && said.contains("is not a line of a record"),
+        "{said}"
+    );
     let out = run(dir, &["lab", "replay", "slabcast-out/frame_0000.png"]);
     assert!(text(&out.stderr).contains("line 1: is not a record's first line"));
 }

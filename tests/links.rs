@@ -60,7 +60,7 @@ fn truth(request: &PathRequest) -> Vec<String> {
     let info = volume.info(digest);
     let transfer = presets::by_name("auto", &info.summary).unwrap();
     let quality = Quality { sums: Sums::I32, ..request.quality };
-    let wanted = BrickNeeds::for_transfer(&transfer, &info, quality.compositing);
+    let wanted = BrickNeeds::for_transfer(&transfer, &info, &quality);
     let store = BrickStore::build(&volume, digest, &wanted);
     let bricks: Vec<_> = store.infos().iter().map(|i| store.brick(i.id).unwrap()).collect();
     let spec = SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: store.key() };
@@ -353,8 +353,7 @@ fn truth_of_each(path: &ViewPath, default: &TransferFunction) -> Vec<String> {
         let sums = classifier.choose_sums(&Quality::default(), &info.lattice).unwrap();
         let quality = Quality { sums, ..Quality::default() };
         let crop = path.crop.map(|c| c.resolve(&info.lattice).unwrap());
-        let wanted =
-            BrickNeeds { crop, ..BrickNeeds::for_transfer(&transfer, &info, quality.compositing) };
+        let wanted = BrickNeeds { crop, ..BrickNeeds::for_transfer(&transfer, &info, &quality) };
         let store = BrickStore::build(&volume, info.digest, &wanted);
         let bricks: Vec<_> = store.infos().iter().map(|i| store.brick(i.id).unwrap()).collect();
         let volume = info.clone();

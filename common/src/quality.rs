@@ -18,6 +18,18 @@ pub enum Kernel {
     Tent,
 }
 
+/// Order of classification (the transfer function) and reconstruction (the kernel).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Classify {
+    /// Values are reconstructed, then classified and lit at each sample of a ray: sharp surfaces
+    /// without rings (docs/design/sharp.md).
+    After,
+    /// Voxels are classified and lit, then blurred by the kernel, as in the paper (section 3).
+    #[default]
+    Before,
+}
+
 /// How the sheets of a pixel are composited.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -71,6 +83,9 @@ pub struct Quality {
     pub std: f64,
     /// Support radius of the Gaussian in lattice steps, 1 to 3; other kernels have one radius.
     pub radius: f64,
+    /// Whether values are classified after or before the kernel reconstructs them.
+    #[serde(skip_serializing_if = "is_default")]
+    pub classify: Classify,
     /// Rule by which sheets become opacity: extinction as here, or the paper's.
     pub compositing: Compositing,
     /// Way in which the sections of a voxel reach their sheets.
@@ -90,6 +105,11 @@ fn is_true(b: &bool) -> bool {
     *b
 }
 
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
+fn is_default(classify: &Classify) -> bool {
+    *classify == Classify::default()
+}
+
 impl Default for Quality {
     fn default() -> Self {
         Quality {
@@ -98,6 +118,7 @@ impl Default for Quality {
             kernel: Kernel::Gaussian,
             std: 0.6,
             radius: 2.0,
+            classify: Classify::default(),
             compositing: Compositing::Linear,
             splat: Splat::Direct,
             sums: Sums::Auto,

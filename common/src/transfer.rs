@@ -575,6 +575,25 @@ impl Support {
         self.intervals.iter().any(|&(a, b)| a <= code && code <= b)
     }
 
+    /// Returns the codes that must be stored where values are classified after reconstruction: from
+    /// the smallest visible code up, or from the largest down, whichever holds fewer of the samples
+    /// that `summary` counts. Codes between two visible ones are in it: without them the field
+    /// would fade to [`Support::background`] through the lower one and draw a surface that is not
+    /// there. NaN is never in it.
+    #[must_use]
+    pub fn filled(&self, summary: &ValueSummary) -> Support {
+        let (Some(&(lo, _)), Some(&(_, hi))) = (self.intervals.first(), self.intervals.last())
+        else {
+            return Support::default();
+        };
+        let (first, last) =
+            (summary.bin(lo.max(summary.min_code)), summary.bin(hi.min(summary.max_code)));
+        let below: u64 = summary.histogram[..first].iter().sum();
+        let above: u64 = summary.histogram[last + 1..].iter().sum();
+        let interval = if above > below { (f64::NEG_INFINITY, hi) } else { (lo, f64::INFINITY) };
+        Support { intervals: vec![interval], nan: false }
+    }
+
     /// Returns whether every code of `other` is relevant here too.
     pub fn covers(&self, other: &Support) -> bool {
         (self.nan || !other.nan)

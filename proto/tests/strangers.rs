@@ -52,7 +52,7 @@ fn work_with(message: ToWorker) {
     match message {
         ToWorker::Scene(scene) => {
             let volume = &scene.volume;
-            let _ = BrickNeeds::for_transfer(&scene.transfer, volume, scene.quality.compositing)
+            let _ = BrickNeeds::for_transfer(&scene.transfer, volume, &scene.quality)
                 .set_key(volume.digest);
             let _ = (volume.summary.total(), volume.summary.range(), volume.summary.bin(0.0));
             assert!(BrickGrid::new(volume.lattice.dims).len() <= 1 << 27);

@@ -39,7 +39,7 @@ impl SceneBricks {
         transfer: &TransferFunction,
         quality: Quality,
     ) -> Result<SceneBricks, Fail> {
-        let wanted = BrickNeeds::for_transfer(transfer, info, quality.compositing);
+        let wanted = BrickNeeds::for_transfer(transfer, info, &quality);
         SceneBricks::with_requirements(volume, info, transfer, quality, &wanted)
     }
 
@@ -97,9 +97,8 @@ impl PathScenes {
         let blame = |e| request.blame(&e);
         let transfer = request.transfer.function(info).map_err(blame)?;
         let tween = Tween::from_path(&request.path, &info.summary).map_err(blame)?;
-        let compositing = request.quality.compositing;
         let wanted =
-            BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, compositing)
+            BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, &request.quality)
                 .map_err(blame)?
                 .with_kept(request.work.keep);
         let SceneBricks { spec: base, bricks } =

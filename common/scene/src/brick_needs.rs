@@ -7,9 +7,13 @@ use crate::path::{CropBox, ViewPath};
 use crate::tween::Tween;
 use sha2::{Digest, Sha256};
 use slabcast_common::brick::BrickSetKey;
-use slabcast_common::quality::{Compositing, InvalidField, Keep};
+use slabcast_common::quality::{Classify, InvalidField, Keep, Quality};
 use slabcast_common::transfer::{Classifier, Support, TransferFunction};
 use slabcast_common::volume::{Digest32, VolumeInfo};
+
+/// Index steps around a visible voxel whose voxels are stored where values are classified after
+/// reconstruction. A kernel reaches two steps; measured in docs/design/sharp.md.
+const HALO: u32 = 2;
 
 /// Data that the bricks of a job must hold: visible voxels, and normals or gradients where the
 /// transfer function uses them.
@@ -21,22 +25,32 @@ pub struct BrickNeeds {
     pub normals: bool,
     /// Whether each voxel needs its gradient magnitude.
     pub gradients: bool,
+    /// Voxels within this many index steps of a visible one, along each axis, are stored too: what
+    /// a kernel that reconstructs values near the visible ones takes in.
+    pub halo: u32,
     /// Box outside of which no voxel is stored; `None` for the whole volume.
     pub crop: Option<CropBox>,
 }
 
 impl BrickNeeds {
     /// Returns what one transfer function sees of the whole volume.
-    pub fn for_transfer(
-        tf: &TransferFunction,
-        info: &VolumeInfo,
-        compositing: Compositing,
-    ) -> BrickNeeds {
-        BrickNeeds {
-            support: Classifier::new(tf, info, compositing).support(),
-            normals: tf.shading.on,
-            gradients: !tf.gradient_opacity.is_empty(),
-            crop: None,
+    pub fn for_transfer(tf: &TransferFunction, info: &VolumeInfo, quality: &Quality) -> BrickNeeds {
+        let classifier = Classifier::new(tf, info, quality.compositing);
+        match quality.classify {
+            Classify::Before => BrickNeeds {
+                support: classifier.support(),
+                normals: tf.shading.on,
+                gradients: !tf.gradient_opacity.is_empty(),
+                halo: 0,
+                crop: None,
+            },
+            Classify::After => BrickNeeds {
+                support: classifier.support().filled(&info.summary),
+                normals: false,
+                gradients: false,
+                halo: HALO,
+                crop: None,
+            },
         }
     }
 
@@ -50,18 +64,19 @@ impl BrickNeeds {
         tf: &TransferFunction,
         tween: Option<&Tween>,
         info: &VolumeInfo,
-        compositing: Compositing,
+        quality: &Quality,
     ) -> Result<BrickNeeds, InvalidField> {
         let crop = path.crop.as_ref().map(|c| c.resolve(&info.lattice)).transpose()?;
         let all: Vec<&TransferFunction> = match tween {
             Some(tween) => tween.key_functions().collect(),
             None => vec![tf],
         };
-        let all = all.into_iter().map(|tf| BrickNeeds::for_transfer(tf, info, compositing));
+        let all = all.into_iter().map(|tf| BrickNeeds::for_transfer(tf, info, quality));
         let union = all.reduce(|a, b| BrickNeeds {
             support: a.support.union(&b.support),
             normals: a.normals || b.normals,
             gradients: a.gradients || b.gradients,
+            halo: a.halo.max(b.halo),
             crop: None,
         });
         Ok(BrickNeeds { crop, ..union.unwrap_or_default() })
@@ -90,6 +105,7 @@ impl BrickNeeds {
         self.support.covers(&other.support)
             && (self.normals || !other.normals)
             && (self.gradients || !other.gradients)
+            && self.halo >= other.halo
             && self.crop == other.crop
     }
 
@@ -105,6 +121,10 @@ impl BrickNeeds {
         }
         if self.gradients {
             h.update(b"gradients");
+        }
+        if self.halo > 0 {
+            h.update(b"halo");
+            h.update(self.halo.to_le_bytes());
         }
         if let Some(crop) = &self.crop {
             h.update(b"crop");
@@ -128,6 +148,7 @@ mod tests {
             support: Support { intervals: vec![(lo, 255.0)], nan: false },
             normals,
             gradients: false,
+            halo: 0,
             crop: crop.map(|c| {
                 let lattice = Lattice::from_spacing([9; 3], [1.0; 3]);
                 c.parse::<Crop>().unwrap().resolve(&lattice).unwrap()

@@ -98,7 +98,7 @@ impl Plan {
         }
         let quality = Quality { sums, ..request.quality };
         let wanted =
-            BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, compositing)?
+            BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, &quality)?
                 .with_kept(request.work.keep);
         Ok(Plan { request: Arc::new(request), wanted, transfer, quality, tween, views })
     }

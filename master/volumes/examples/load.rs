@@ -2,7 +2,7 @@
 //!
 //! `cargo run --release -p slabcast-volumes --example load -- FILE [PRESET]`
 
-use slabcast_common::quality::Compositing;
+use slabcast_common::quality::Quality;
 use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_scene::presets;
 use slabcast_volumes::{BrickStore, histogram_sketch, open};
@@ -36,7 +36,7 @@ fn main() {
             std::process::exit(1);
         }
     };
-    let needs = BrickNeeds::for_transfer(&tf, &volume.info(digest), Compositing::Linear);
+    let needs = BrickNeeds::for_transfer(&tf, &volume.info(digest), &Quality::default());
     let start = Instant::now();
     let store = BrickStore::build(&volume, digest, &needs);
     let built = ms(start);

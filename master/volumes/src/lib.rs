@@ -5,14 +5,14 @@
 //! is encoded once, and every worker is sent those bytes.
 //!
 //! ```
-//! use slabcast_common::quality::Compositing;
+//! use slabcast_common::quality::Quality;
 //! use slabcast_scene::{brick_needs::BrickNeeds, presets};
 //! use slabcast_volumes::{BrickStore, open};
 //!
 //! let volume = open("formula:spheres:32".as_ref()).expect("a formula of this name");
 //! let digest = volume.digest();
 //! let transfer = presets::by_name("peer-opaque", &volume.summary).expect("a preset");
-//! let needs = BrickNeeds::for_transfer(&transfer, &volume.info(digest), Compositing::Linear);
+//! let needs = BrickNeeds::for_transfer(&transfer, &volume.info(digest), &Quality::default());
 //! let store = BrickStore::build(&volume, digest, &needs);
 //! let first = store.infos()[0];
 //! assert_eq!(store.encoded(first.id).expect("its bytes").len(), first.bytes as usize);

@@ -175,6 +175,11 @@ fn cut<T: Copy + Into<f64> + Sync>(
     relevant: impl Fn(T) -> bool + Sync,
 ) -> Vec<(BrickInfo, Mutex<Content>)> {
     let field = Codes { codes, dims: volume.lattice.dims };
+    let near = (needs.halo > 0).then(|| {
+        let inside = |voxel| needs.crop.is_none_or(|c| c.contains(&volume.lattice, voxel));
+        let visible = |voxel, offset: usize| relevant(codes[offset]) && inside(voxel);
+        VoxelMask::new(field.dims, visible).dilated(needs.halo)
+    });
     let grid = BrickGrid::new(field.dims);
     let gradient_matrix = volume.gradient_matrix();
     let row = |row: u32| {
@@ -184,8 +189,17 @@ fn cut<T: Copy + Into<f64> + Sync>(
         for x in 0..grid.dims[0] {
             let id = grid.id([x, y, z]);
             found.clear();
-            let inside = |voxel| needs.crop.is_none_or(|c| c.contains(&volume.lattice, voxel));
-            field.collect([x, y, z].map(|n| n * BRICK_EDGE), &relevant, &inside, &mut found);
+            let corner = [x, y, z].map(|n| n * BRICK_EDGE);
+            match &near {
+                Some(near) => {
+                    field.collect(corner, &|_| true, &|voxel| near.get(voxel), &mut found)
+                }
+                None => {
+                    let inside =
+                        |voxel| needs.crop.is_none_or(|c| c.contains(&volume.lattice, voxel));
+                    field.collect(corner, &relevant, &inside, &mut found);
+                }
+            }
             let index = &found.index[..found.voxels];
             if index.is_empty() {
                 continue;
@@ -216,6 +230,70 @@ fn cut<T: Copy + Into<f64> + Sync>(
     let rows = grid.dims[1] * grid.dims[2];
     let rows: Vec<Vec<_>> = (0..rows).into_par_iter().map(row).collect();
     rows.into_iter().flatten().collect()
+}
+
+/// A bit for each voxel of a volume, in rows along x of whole words.
+struct VoxelMask {
+    dims: [u32; 3],
+    /// Words of a row.
+    words: usize,
+    bits: Vec<u64>,
+}
+
+impl VoxelMask {
+    /// Marks the voxels, given by index and offset in the volume's samples, for which `marked` holds.
+    fn new(dims: [u32; 3], marked: impl Fn([u32; 3], usize) -> bool + Sync) -> Self {
+        let [nx, ny, nz] = dims.map(|n| n as usize);
+        let words = nx.div_ceil(64);
+        let mut bits = vec![0u64; words * ny * nz];
+        bits.par_chunks_mut(words).enumerate().for_each(|(row, bits)| {
+            let (y, z) = ((row % ny) as u32, (row / ny) as u32);
+            for x in 0..nx {
+                let bit = u64::from(marked([x as u32, y, z], row * nx + x));
+                bits[x / 64] |= bit << (x % 64);
+            }
+        });
+        VoxelMask { dims, words, bits }
+    }
+
+    /// Returns the mask of voxels within `steps` index steps of a marked one along each axis.
+    fn dilated(mut self, steps: u32) -> Self {
+        let [ny, nz] = [self.dims[1], self.dims[2]].map(|n| n as usize);
+        let words = self.words;
+        for _ in 0..steps {
+            self.bits.par_chunks_mut(words).for_each(|row| {
+                let mut before = 0;
+                for i in 0..words {
+                    let (here, after) = (row[i], row.get(i + 1).copied().unwrap_or(0));
+                    row[i] = here | here << 1 | before >> 63 | here >> 1 | after << 63;
+                    before = here;
+                }
+            });
+        }
+        // Rows along y, then layers along z: each is the union of its neighbours.
+        for (n, stride) in [(ny, 1), (nz, ny)] {
+            let from = &self.bits;
+            let mut to = vec![0u64; from.len()];
+            to.par_chunks_mut(words).enumerate().for_each(|(row, to)| {
+                let at = row / stride % n;
+                let (first, last) =
+                    (at.saturating_sub(steps as usize), (at + steps as usize).min(n - 1));
+                for other in first..=last {
+                    let other = (row + other * stride - at * stride) * words;
+                    for (to, from) in to.iter_mut().zip(&from[other..other + words]) {
+                        *to |= from;
+                    }
+                }
+            });
+            self.bits = to;
+        }
+        self
+    }
+
+    fn get(&self, [x, y, z]: [u32; 3]) -> bool {
+        let row = z as usize * self.dims[1] as usize + y as usize;
+        self.bits[row * self.words + x as usize / 64] >> (x % 64) & 1 == 1
+    }
 }
 
 /// The relevant voxels of one brick, in ascending local index.

@@ -2,7 +2,7 @@
 //! differ; where they are missing, a test prints `skipped: needs shared/data` and passes.
 
 use glam::DVec3;
-use slabcast_common::quality::Compositing;
+use slabcast_common::quality::Quality;
 use slabcast_common::shade::encode_normal;
 use slabcast_common::volume::Volume;
 use slabcast_scene::brick_needs::BrickNeeds;
@@ -169,7 +169,7 @@ fn real_head_bricks_match_a_plain_loop() {
     let v = volume(&path);
     let digest = v.digest();
     let tf = presets::by_name("peer-opaque", &v.summary).unwrap();
-    let wanted = BrickNeeds::for_transfer(&tf, &v.info(digest), Compositing::Linear);
+    let wanted = BrickNeeds::for_transfer(&tf, &v.info(digest), &Quality::default());
     let store = BrickStore::build(&v, digest, &wanted);
     println!("mri256: open, digest, build {:?}", start.elapsed());
     let m = v.gradient_matrix();

@@ -7,12 +7,13 @@
 
 use slabcast_scene::path::ViewPath;
 
-const QUALITY: [&str; 10] = [
+const QUALITY: [&str; 11] = [
     "thickness",
     "eps",
     "kernel",
     "std",
     "radius",
+    "classify",
     "compositing",
     "splat",
     "sums",

@@ -8,13 +8,16 @@ use super::wire;
 use crate::convert::numbers::finite_all;
 use crate::convert::{WireError, enum_conversions};
 use slabcast_common::image::{Background, PixelFormat};
-use slabcast_common::quality::{Compositing, Kernel, Quality, Splat, Sums};
+use slabcast_common::quality::{Classify, Compositing, Kernel, Quality, Splat, Sums};
 use slabcast_common::shade::{HeadWord, Light, Shading};
 use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::volume::SampleKind;
 
 enum_conversions!(kernel_to_wire, kernel_from_wire, Kernel, wire::Kernel, Some(Kernel::Gaussian),
     { Gaussian <=> Gaussian, Bspline <=> Bspline, Tent <=> Tent });
+enum_conversions!(classify_to_wire, classify_from_wire, Classify, wire::Classify,
+    Some(Classify::Before),
+    { After <=> After, Before <=> Before });
 enum_conversions!(compositing_to_wire, compositing_from_wire, Compositing, wire::Compositing,
     Some(Compositing::Linear),
     { Linear <=> Linear, Constant <=> Constant, Paper <=> Paper });
@@ -48,6 +51,7 @@ pub(super) fn quality_to_wire(q: &Quality) -> wire::Quality {
         sums: sums_to_wire(q.sums),
         cull: Some(q.cull),
         three_colours: !q.grey,
+        classify: classify_to_wire(q.classify),
     }
 }
 
@@ -60,6 +64,7 @@ pub(super) fn quality_from_wire(q: wire::Quality) -> Result<Quality, WireError> 
         kernel: kernel_from_wire("kernel", q.kernel)?,
         std: q.std.unwrap_or(d.std),
         radius: q.radius.unwrap_or(d.radius),
+        classify: classify_from_wire("classify", q.classify)?,
         compositing: compositing_from_wire("compositing", q.compositing)?,
         splat: splat_from_wire("splat", q.splat)?,
         sums: sums_from_wire("sums", q.sums)?,

@@ -7,7 +7,7 @@ use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, SceneId};
 use slabcast_common::kernel::Lean;
 use slabcast_common::message::SceneSpec;
-use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
+use slabcast_common::quality::{Classify, Compositing, Kernel, Quality, Sums};
 use slabcast_common::shade::{Light, Shading};
 use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Projection, View};
@@ -166,13 +166,15 @@ pub fn quality(sums: impl Strategy<Value = Sums>) -> impl Strategy<Value = Quali
         (Just(Kernel::Gaussian), 0.4..1.0f64, 1.0..3.0f64),
         (prop_oneof![Just(Kernel::Bspline), Just(Kernel::Tent)], Just(d.std), Just(d.radius)),
     ];
-    (0.02..100.0f64, 0.0..=0.5f64, kernel, compositing, sums, any::<bool>()).prop_map(
-        |(thickness, eps, (kernel, std, radius), compositing, sums, cull)| Quality {
+    let classify = prop_oneof![Just(Classify::After), Just(Classify::Before)];
+    (0.02..100.0f64, 0.0..=0.5f64, kernel, (classify, compositing), sums, any::<bool>()).prop_map(
+        |(thickness, eps, (kernel, std, radius), (classify, compositing), sums, cull)| Quality {
             thickness,
             eps,
             kernel,
             std,
             radius,
+            classify,
             compositing,
             sums,
             cull,

@@ -12,7 +12,7 @@ use crate::volume::InputArgs;
 use clap::builder::{PossibleValuesParser, TypedValueParser, ValueParser};
 use slabcast_common::image::Background;
 use slabcast_common::quality::{
-    Borders, Compositing, Kernel, Quality, Schedule, Splat, Sums, Work,
+    Borders, Classify, Compositing, Kernel, Quality, Schedule, Splat, Sums, Work,
 };
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_scene::path::{
@@ -179,6 +179,12 @@ pub struct QualityArgs {
     #[arg(long, value_name = "STEPS", default_value = "2.0", value_parser = parse::number,
           allow_negative_numbers = true, hide_short_help = true)]
     radius: f64,
+    /// Classify values after or before the kernel reconstructs them
+    ///
+    /// `after` gives sharp surfaces; `before` blurs classified voxels, as in the paper.
+    #[arg(long, default_value = "before", value_name = "ORDER", hide_short_help = true,
+          value_parser = words(&[("after", Classify::After), ("before", Classify::Before)]))]
+    classify: Classify,
     /// How sheets are composited
     ///
     /// `paper` is the paper's additive opacity.
@@ -215,6 +221,7 @@ impl QualityArgs {
             kernel: self.kernel,
             std: self.std,
             radius: self.radius,
+            classify: self.classify,
             compositing: self.compositing,
             splat: self.splat,
             sums: self.sums,

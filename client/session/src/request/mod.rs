@@ -122,8 +122,7 @@ impl RenderRequest {
         let function = self.transfer.function(info).map_err(|e| self.blame(&e))?;
         let blame = |e| self.blame(&e);
         let tween = Tween::from_path(&self.path, &info.summary).map_err(blame)?;
-        let compositing = self.quality.compositing;
-        BrickNeeds::for_path(&self.path, &function, tween.as_ref(), info, compositing)
+        BrickNeeds::for_path(&self.path, &function, tween.as_ref(), info, &self.quality)
             .map_err(blame)?;
         let cameras = self.path.prepare(&info.lattice, orientation).map_err(blame)?;
         for i in 0..self.path.frames() {
@@ -149,12 +148,13 @@ impl RenderRequest {
     /// Returns a refusal that names where the user wrote what is refused: a flag, or a field of a
     /// file.
     pub fn blame(&self, refused: &InvalidField) -> Fail {
-        const FLAGS: [&str; 24] = [
+        const FLAGS: [&str; 25] = [
             "thickness",
             "eps",
             "kernel",
             "std",
             "radius",
+            "classify",
             "compositing",
             "splat",
             "sums",

@@ -12,7 +12,7 @@ fn span(a: f64, b: f64) -> Support {
 /// Builds a store and compares it with a plain loop over all voxels of the volume.
 fn check(volume: &Volume, support: &Support, normals: bool) -> BrickStore {
     let support = support.clone();
-    check_all(volume, &BrickNeeds { support, normals, gradients: false, crop: None })
+    check_all(volume, &BrickNeeds { support, normals, gradients: false, halo: 0, crop: None })
 }
 
 fn check_all(volume: &Volume, needs: &BrickNeeds) -> BrickStore {
@@ -68,8 +68,17 @@ fn check_all(volume: &Volume, needs: &BrickNeeds) -> BrickStore {
                 let offset = ((k * dims[1] + j) * dims[0] + i) as usize;
                 let code = volume.samples.code(offset);
                 let found = seen.remove(&[k, j, i]);
-                let inside = needs.crop.is_none_or(|c| c.contains(&volume.lattice, [i, j, k]));
-                if !support.contains(code) || !inside {
+                let halo = needs.halo;
+                let near = |n: u32, at: u32| at.saturating_sub(halo)..=(at + halo).min(n - 1);
+                let visible = |at: [u32; 3]| {
+                    let offset = (at[2] * dims[1] + at[1]) * dims[0] + at[0];
+                    support.contains(volume.samples.code(offset as usize))
+                        && needs.crop.is_none_or(|c| c.contains(&volume.lattice, at))
+                };
+                let wanted = near(dims[2], k).any(|z| {
+                    near(dims[1], j).any(|y| near(dims[0], i).any(|x| visible([x, y, z])))
+                });
+                if !wanted {
                     assert!(found.is_none(), "({i}, {j}, {k}) is not relevant");
                     continue;
                 }
@@ -118,7 +127,7 @@ proptest! {
                     Crop { unit: CropUnit::Unit, x, y: [share, None], ..Crop::default() };
             crop.resolve(&volume.lattice).unwrap()
         });
-        check_all(&volume, &BrickNeeds { support, normals, gradients: seed % 3 == 0, crop });
+        check_all(&volume, &BrickNeeds { support, normals, gradients: seed % 3 == 0, halo: seed as u32 % 4, crop });
     }
 }
 
@@ -173,8 +182,13 @@ fn relevance_table_matches_support_for_every_code() {
 #[test]
 fn brick_encoding_is_shared_between_threads() {
     let v = Volume::from_fn_u8("v", [32; 3], |i, j, k| (i * j + k) as u8 | 1);
-    let needs =
-        BrickNeeds { support: span(1.0, 255.0), normals: true, gradients: false, crop: None };
+    let needs = BrickNeeds {
+        support: span(1.0, 255.0),
+        normals: true,
+        gradients: false,
+        halo: 0,
+        crop: None,
+    };
     let store = BrickStore::build(&v, Digest32::default(), &needs);
     let id = store.infos()[7].id;
     let seen: Vec<usize> = std::thread::scope(|s| {

@@ -368,6 +368,19 @@ impl Classifier {
         OpticalSample { sigma: self.rule.payload(a) as f32, rgb: [r as f32, g as f32, b as f32] }
     }
 
+    /// Returns extinction per vox and linear colour at a reconstructed value, given as a code that
+    /// need not be whole. Codes beyond the volume's smallest and largest have their look; NaN has
+    /// none.
+    pub fn optics_at(&self, code: f64) -> [f64; 4] {
+        if code.is_nan() {
+            return [0.0; 4];
+        }
+        let x = self.x_of(code.clamp(self.summary.min_code, self.summary.max_code));
+        let [_, a] = interpolate(&self.opacities, x);
+        let [_, r, g, b] = interpolate(&self.colors, x);
+        [self.rule.payload(a), r, g, b]
+    }
+
     /// Returns the optical sample of sample `i` of `samples`, which are of this volume. Ignores
     /// gradients.
     ///

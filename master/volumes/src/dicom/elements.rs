@@ -127,7 +127,7 @@ impl File {
                         Some("80" | "81") => "JPEG-LS",
                         Some("90" | "91" | "92" | "93" | "201" | "202" | "203") => "JPEG 2000",
                         Some("100" | "101" | "102" | "103" | "104" | "105" | "106") => "video",
-                        _ => "no encoding that is known",
+                        _ => "not an encoding that is known",
                     };
                     return Err(Problem::unsupported(
                         "TransferSyntaxUID",

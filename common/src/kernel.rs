@@ -85,6 +85,27 @@ impl Profile {
         }
     }
 
+    /// Returns the derivative g'(u) at distance `u` vox, per vox^2. The tent's is that of its sides,
+    /// and 0 in its middle.
+    pub fn slope_at(&self, u: f64) -> f64 {
+        if u.abs() >= self.radius || u == 0.0 {
+            return 0.0;
+        }
+        match self.kernel {
+            Kernel::Gaussian => {
+                let square = self.std * self.std;
+                -u / square * libm::exp(-u * u / (2.0 * square)) / self.norm
+            }
+            Kernel::Bspline => {
+                let step = 0.5 * self.radius;
+                let (t, rest) = (u.abs() / step, 2.0 - u.abs() / step);
+                let slope = if t < 1.0 { t * (1.5 * t - 2.0) } else { -0.5 * rest * rest };
+                slope * u.signum() / (step * step)
+            }
+            Kernel::Tent => -u.signum() / (self.radius * self.radius),
+        }
+    }
+
     /// Returns the integral of g from -radius to `u` vox: 0 to 1.
     pub fn integral_to(&self, u: f64) -> f64 {
         let u = u.clamp(-self.radius, self.radius);

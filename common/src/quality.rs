@@ -210,6 +210,9 @@ impl Quality {
                 }
             }
         }
+        if self.classify == Classify::After {
+            self.check_after()?;
+        }
         if self.kernel == Kernel::Tent && self.sums == Sums::I16 {
             return Err(InvalidField::new(
                 "sums",
@@ -220,6 +223,34 @@ impl Quality {
             return Err(InvalidField::new(
                 "splat",
                 "this version draws `direct` splats only, which were faster; use them",
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl Quality {
+    /// Checks what classification after reconstruction asks of other fields.
+    fn check_after(&self) -> Result<(), InvalidField> {
+        if self.thickness > 1.0 {
+            let problem = format!(
+                "{} is too thick to reconstruct values from: with `--classify after` give at most \
+                 1, or use `--classify before`",
+                self.thickness
+            );
+            return Err(InvalidField::new("thickness", problem));
+        }
+        if self.compositing != Compositing::Linear {
+            return Err(InvalidField::new(
+                "compositing",
+                "is a rule for voxels that are classified before they are splatted; use it with \
+                 `--classify before`",
+            ));
+        }
+        if self.sums == Sums::F32 {
+            return Err(InvalidField::new(
+                "sums",
+                "`--classify after` adds whole numbers; use `i16`, `i32` or `auto`",
             ));
         }
         Ok(())

@@ -208,6 +208,27 @@ impl Shader {
         LightTerms { lambert: lit[0][0], gloss: lit[1][0] }
     }
 
+    /// Returns the unit direction towards the light in world axes; `None` for a head light.
+    pub fn light_direction(&self) -> Option<Vec3> {
+        self.light
+    }
+
+    /// Turns the first `n` cosines between normals and the light into factors of base colours, and
+    /// those between normals and the half vector into what is added.
+    #[inline(always)]
+    pub fn terms<const MOST: usize>(
+        &self,
+        light: &mut [f32; MOST],
+        half: &mut [f32; MOST],
+        n: usize,
+    ) {
+        self.power.raise_all(half, n);
+        for i in 0..n.min(MOST) {
+            light[i] = self.ambient + self.diffuse * light[i].max(0.0);
+            half[i] *= self.specular;
+        }
+    }
+
     /// Computes [`Shader::light_terms`] of many voxels. Voxel i has normal code `normals[i]` and
     /// sees the eye in unit direction `to_eye(i)`. `lit[0]` gets the factors of base colours,
     /// `lit[1]` what is added. Loops run over plain arrays of a length that compilers don't know,
@@ -246,10 +267,9 @@ impl Shader {
                 }
             }
         }
-        self.power.raise_all(half, n);
+        self.terms(light, half, n);
         for i in 0..n {
-            let diffuse = self.ambient + self.diffuse * light[i].max(0.0);
-            let gloss = self.specular * half[i];
+            let (diffuse, gloss) = (light[i], half[i]);
             light[i] = if normals[i] != NO_NORMAL { diffuse } else { 1.0 };
             half[i] = if normals[i] != NO_NORMAL { gloss } else { 0.0 };
         }

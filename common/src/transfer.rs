@@ -4,7 +4,7 @@
 use crate::brick::Brick;
 use crate::gradient::decode_magnitude;
 use crate::math::linear_from_srgb;
-use crate::quality::{Compositing, InvalidField, Quality, Sums, json_error};
+use crate::quality::{Classify, Compositing, InvalidField, Quality, Sums, json_error};
 use crate::shade::Shading;
 use crate::volume::{Lattice, SampleKind, Samples, ValueSummary, VolumeInfo};
 use serde::{Deserialize, Serialize};
@@ -495,6 +495,20 @@ impl Classifier {
         let d = quality.thickness;
         let enough = (2.0 * 255.0 * quality.eps).min(3.0) * (d * d).min(1.0);
         let depth = lattice.diagonal() / lattice.vox();
+        if quality.classify == Classify::After {
+            // Sums hold values: 16 bits round them by some 1/4000 of all codes.
+            let support = self.support();
+            let visible = match (support.intervals.first(), support.intervals.last()) {
+                (Some(first), Some(last)) => last.1.min(self.summary.max_code) - first.0,
+                _ => f64::INFINITY,
+            };
+            let narrow = visible * 16.0 < self.summary.max_code - self.summary.min_code;
+            return Ok(match quality.sums {
+                Sums::Auto if quality.fits_i16() && !narrow => Sums::I16,
+                Sums::Auto => Sums::I32,
+                sums => sums,
+            });
+        }
         match quality.sums {
             Sums::Auto if self.uncapped => Ok(Sums::F32),
             Sums::Auto if quality.fits_i16() && self.i16_error_estimate(d, depth) <= enough => {

@@ -1,6 +1,7 @@
 //! A scene and one view of it, with the tables that all tiles share.
 
-use crate::kernels::composite::Rule;
+use crate::kernels::composite::field::{FieldRule, FieldScene};
+use crate::kernels::composite::{LANES, Row, Rule};
 use crate::kernels::{Simd, Work, lut};
 use crate::primitives::footprint::{
     Footprint, Footprints, Lean, Leaning, Profile, Sections, Shelf,
@@ -13,11 +14,12 @@ use slabcast_common::bounds::{i16_units_per_payload, i32_units_per_payload};
 use slabcast_common::brick::{Brick, BrickGrid, TightBox, local_position};
 use slabcast_common::ids::BrickId;
 use slabcast_common::message::SceneSpec;
-use slabcast_common::quality::{Compositing, Quality, Sums};
+use slabcast_common::quality::{Classify, Compositing, Quality, Sums};
 use slabcast_common::shade::{LightTerms, NO_NORMAL, Shader};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::Classifier;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, View};
+use slabcast_common::volume::Samples;
 use std::sync::Arc;
 
 /// A volume's appearance under one transfer function and quality, without its voxels. Frames of all
@@ -38,6 +40,9 @@ pub struct Scene {
     pub payload_max: f64,
     /// Whether every colour is grey and the quality allows two channels instead of four.
     pub grey: bool,
+    /// Values and their looks, where they are classified after reconstruction.
+    #[doc(hidden)]
+    pub field: Option<FieldScene>,
     shelf: Arc<Shelf>,
 }
 
@@ -46,7 +51,9 @@ impl Scene {
     pub fn new(spec: &SceneSpec) -> Self {
         let classifier = Classifier::new(&spec.transfer, &spec.volume, spec.quality.compositing);
         let payload_max = classifier.payload_max();
+        let after = spec.quality.classify == Classify::After;
         Scene {
+            field: after.then(|| FieldScene::new(spec, &classifier)),
             classifier,
             shader: spec.transfer.shading.on.then(|| Shader::new(&spec.transfer.shading)),
             quality: spec.quality,
@@ -89,6 +96,10 @@ pub struct Frame {
     #[doc(hidden)]
     pub footprints: Footprints,
     pub(crate) rule: Rule,
+    /// How a field's planes become light; `None` where voxels are classified before they are
+    /// splatted.
+    #[doc(hidden)]
+    pub field: Option<Arc<FieldRule>>,
     /// Raw units of a sheet's sums for one unit of payload; for 16-bit sums times the factors of
     /// their weights.
     pub raw_scale: f32,
@@ -154,12 +165,14 @@ impl Frame {
     /// differ from it in more than that: its slivers are not merged ([`Sections::given_away`]).
     #[must_use]
     pub fn never_shut(self) -> Self {
-        Frame { rule: self.rule.never_shut(), ..self }
+        let field = self.field.as_ref().map(|field| Arc::new(field.never_shut()));
+        Frame { rule: self.rule.never_shut(), field, ..self }
     }
 
     /// Prepares `view` of `scene` for any number of render threads.
     pub fn new(scene: Arc<Scene>, view: View) -> Self {
         let q = &scene.quality;
+        let after = scene.field.is_some();
         let whole = TightBox { lo: [0; 3], hi: scene.dims.map(|n| n - 1) };
         let range = view.project(&whole).map_or(SheetRange::new(0, 0), |p| p.sheets);
         // One sheet farther for the peek.
@@ -182,14 +195,19 @@ impl Frame {
             Projection::Ortho { .. } => Some(view.direction_to_eye(DVec3::ZERO)),
             Projection::Persp { .. } => None,
         };
-        let footprints = Footprints::new(&view, q.kernel, range, spread, scene.shelf.clone());
+        let footprints =
+            Footprints::new(&view, q.kernel, range, spread, scene.shelf.clone(), after);
         let reach = footprints.at(0).and_then(|f| f.reach());
-        let sections = scene.shelf.sections(&profile, d, phases, merged);
+        let sections = if after {
+            scene.shelf.planes(&profile, d, phases)
+        } else {
+            scene.shelf.sections(&profile, d, phases, merged)
+        };
         let largest = (range.first..range.end).find_map(|k| view.scale_at(k)).unwrap_or(1.0);
         let leans = !view.kernel_lean.is_none();
         let leaning = leans.then(|| Leaning::new(&view, &profile, &sections, largest));
         let leaning = leaning.filter(Leaning::shows);
-        let level = leaning.is_none() && q.sums != Sums::F32;
+        let level = leaning.is_none() && q.sums != Sums::F32 && !after;
         let lattice_rows = level.then(|| LatticeRows::new(&view, scene.dims, spread.y, range.end));
         let mut lattice_rows = lattice_rows.flatten();
         let (raw_scale, unit) = match q.sums {
@@ -236,7 +254,12 @@ impl Frame {
             let v = view.offset_in_eye(local_position(i)).to_array();
             offsets.iter_mut().zip(v).for_each(|(offsets, v)| offsets[usize::from(i)] = v);
         }
+        let field = scene.field.as_ref().map(|field| {
+            let (shader, dims) = (scene.shader.as_ref(), scene.dims);
+            FieldRule::new(field, shader, q, &view, spread, dims).into()
+        });
         Frame {
+            field,
             flat,
             leaning,
             lattice_rows,
@@ -251,10 +274,15 @@ impl Frame {
         }
     }
 
+    /// Returns whether sheets hold a field's planes, which are classified when they close.
+    pub(crate) fn is_field(&self) -> bool {
+        self.field.is_some()
+    }
+
     /// Returns whether the colour rule reads the neighbouring sheets' sums, so that a slab hands
     /// its last sheet on to the next.
     pub fn looks_at_neighbours(&self) -> bool {
-        self.scene.quality.compositing == Compositing::Linear
+        self.is_field() || self.scene.quality.compositing == Compositing::Linear
     }
 
     /// Offsets of the 512 voxels of a brick from its corner, in vox, by the eye's axes.
@@ -354,6 +382,31 @@ impl Frame {
         out: &mut [[f32; MOST]; 4],
     ) {
         simd.run(Payloads { frame: self, samples, normals, eyes, out });
+    }
+
+    /// Returns what voxel `i` of `brick` adds to a plane of a field per unit of weight, in raw
+    /// units.
+    #[inline(always)]
+    pub(crate) fn field_payload(&self, rule: &FieldRule, brick: &Brick, i: usize) -> f32 {
+        rule.payload(match &brick.values {
+            Samples::U8(v) => v[i].into(),
+            Samples::U16(v) => v[i].into(),
+            Samples::F32(v) => v[i].to_bits(),
+        })
+    }
+
+    /// Composites sheet k of a field at some pixels ([`FieldRule::close_row`]).
+    #[inline(always)]
+    pub(crate) fn close_field_row(
+        &self,
+        row: &mut Row,
+        at: (&[[i32; 2]; LANES], i32),
+        live: u32,
+    ) -> u32 {
+        let (Some(rule), Some(scene)) = (&self.field, &self.scene.field) else {
+            unreachable!("a frame whose sheets hold planes")
+        };
+        rule.close_row(scene, self.scene.shader.as_ref(), row, at, live)
     }
 
     /// Returns what voxel `i` of `brick`, at eye coordinates `eye` in vox, adds to a sheet per unit

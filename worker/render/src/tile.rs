@@ -23,7 +23,7 @@
 //! for those whose kernel leans, `perspective` for most perspective views, and `shared_rows` for
 //! views with a level camera. `Part::draw` picks the fastest that takes the view.
 
-use crate::geometry::general::{GeneralScratch, Kind, Queues, RenderGeneral};
+use crate::geometry::general::{GeneralScratch, Kind, Queues, RenderGeneral, RenderGeneralField};
 use crate::geometry::open_sheets::Store;
 use crate::geometry::ortho::{self, RenderOrtho};
 use crate::geometry::perspective::{self, Deep, RenderPerspective, RenderPerspectiveSharedRows};
@@ -242,6 +242,19 @@ impl<'a> Part<'a> {
         let part = self;
         let Scratch { general, whole, pixels, .. } = scratch;
         let GeneralScratch { kinds, queues } = general;
+        if part.frame.is_field() {
+            match part.frame.scene.quality.sums {
+                Sums::I16 => {
+                    let kind = &mut kinds.shorts;
+                    simd.run(RenderGeneralField { part, kind, queues, pixels, io });
+                }
+                _ => {
+                    let kind = &mut kinds.longs;
+                    simd.run(RenderGeneralField { part, kind, queues, pixels, io });
+                }
+            }
+            return;
+        }
         match part.frame.scene.quality.sums {
             Sums::F32 => {
                 let kind = &mut kinds.floats;

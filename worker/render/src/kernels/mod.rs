@@ -42,6 +42,7 @@ macro_rules! at_level {
 }
 
 pub mod composite;
+pub mod field;
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod lanes;
 pub mod lut;
@@ -167,6 +168,16 @@ pub fn nearest(x: f32) -> i32 {
     let rounded = if x < WHOLE { rounded } else { x };
     // SAFETY: it is 0 to LARGEST.
     unsafe { rounded.to_int_unchecked::<i32>() }
+}
+
+/// Returns the whole number nearest to `x`, ties to even. What is not an i32 becomes the nearest
+/// that is, and NaN zero.
+#[inline(always)]
+pub fn nearest_signed(x: f32) -> i32 {
+    let x = if x < LARGEST { x } else { LARGEST };
+    let x = if x > -LARGEST { x } else { -LARGEST };
+    // SAFETY: it is -LARGEST to LARGEST; both selects give a bound for NaN.
+    unsafe { x.round_ties_even().to_int_unchecked::<i32>() }
 }
 
 /// 32-bit fixed point: one rounding, to nearest and of two to the even one, when a contribution is

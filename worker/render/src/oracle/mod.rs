@@ -1,5 +1,6 @@
 //! The renderer written plainly, as a reference for the fast one to equal byte for byte.
 
 pub mod explain;
+mod field;
 pub mod serial;
 pub mod work_counters;

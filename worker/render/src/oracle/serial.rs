@@ -30,6 +30,12 @@ pub(crate) fn render_counting(
     bricks: &[Arc<Brick>],
     counters: Option<&mut WorkCounters>,
 ) -> Picture {
+    if frame.is_field() {
+        return match frame.scene.quality.sums {
+            Sums::I16 => super::field::render::<i16>(frame, bricks, counters),
+            _ => super::field::render::<i32>(frame, bricks, counters),
+        };
+    }
     match frame.scene.quality.sums {
         Sums::F32 => {
             let add = |to: &mut [[f32; 4]], p: &Section<'_>| {

@@ -18,6 +18,7 @@
 //! f64 and kept in f32.
 
 use crate::primitives::Tap;
+use crate::primitives::field_taps::FieldTaps;
 use crate::primitives::profile_table::ProfileTable;
 use crate::primitives::sizes::{LINE, MOST, SHEAR_COLUMNS, SHEAR_ROWS};
 use glam::DVec3;
@@ -47,6 +48,9 @@ pub struct Sections {
     weights: Vec<f32>,
     /// Weights over the thickness, in lattice steps, as [`fixed`] point.
     fixed: Vec<i16>,
+    /// The same for the four channels of a field, value and derivatives; empty where sheets hold
+    /// sections.
+    field: FieldTaps,
     stride: usize,
 }
 
@@ -94,8 +98,16 @@ impl Sections {
             _ => (radius, radius - 1),
         };
         let shift = phases.trailing_zeros();
-        let mut sections =
-            Sections { phases, shift, front, back, weights: vec![], fixed: vec![], stride: 1 };
+        let mut sections = Sections {
+            phases,
+            shift,
+            front,
+            back,
+            weights: vec![],
+            fixed: vec![],
+            field: FieldTaps::default(),
+            stride: 1,
+        };
         let most = (0..phases).map(|p| sections.span(p).1).max().unwrap_or(1);
         sections.stride = most as usize;
         for p in 0..phases {
@@ -114,6 +126,40 @@ impl Sections {
             }
         }
         sections
+    }
+
+    /// Samples a kernel's profile at planes `thickness` vox apart, the middles of sheets, at
+    /// `phases` depths a sheet: planes of a field and not sections.
+    pub fn planes(profile: &Profile, thickness: f64, phases: i32) -> Self {
+        let radius = whole_phases(profile, thickness, phases);
+        let (front, back) = (radius - phases / 2, radius - phases / 2 - 1);
+        let mut planes = Sections {
+            phases,
+            shift: phases.trailing_zeros(),
+            front,
+            back,
+            weights: vec![],
+            fixed: vec![],
+            field: FieldTaps::default(),
+            stride: 1,
+        };
+        let most = (0..phases).map(|p| planes.span(p).1).max().unwrap_or(1).max(1);
+        planes.stride = most as usize;
+        for p in 0..phases {
+            let at = f64::from(p) / f64::from(phases);
+            for plane in 0..most {
+                let u = (f64::from(planes.first(p)) + f64::from(plane) + 0.5 - at) * thickness;
+                planes.weights.push(profile.at(u) as f32);
+                planes.fixed.push(fixed(profile.at(u) * profile.spread));
+                planes.field.push(2, profile, u);
+            }
+        }
+        planes
+    }
+
+    /// Weights of the planes of a field, [`Sections::most`] a phase.
+    pub(crate) fn field(&self) -> &FieldTaps {
+        &self.field
     }
 
     /// Returns the largest share of a pixel's light, 0 to 1, that may change its sheet where
@@ -238,6 +284,7 @@ pub struct Leaning {
 impl Leaning {
     /// For sheets of the thickness of `view`, cut by `sections`, of a kernel with profile `deep`
     /// along the depth; `scale`: pixels a vox at most.
+    /// Of a field, planes lie beside their voxels and not sections.
     pub(crate) fn new(view: &View, deep: &Profile, sections: &Sections, scale: f64) -> Leaning {
         let (lean, thickness) = (&view.kernel_lean, view.thickness);
         // Where two spacings are alike but for their last digits rows and sections lie aside by
@@ -253,7 +300,13 @@ impl Leaning {
         for p in 0..sections.phases {
             let at = f64::from(p) / f64::from(sections.phases);
             let first = (f64::from(sections.first(p)) - at) * thickness;
-            deep.places(first, thickness, &mut behind);
+            if sections.field.is_empty() {
+                deep.places(first, thickness, &mut behind);
+            } else {
+                for (plane, behind) in behind.iter_mut().enumerate() {
+                    *behind = first + (plane as f64 + 0.5) * thickness;
+                }
+            }
             for (axis, slope) in slopes.into_iter().enumerate() {
                 for behind in &behind {
                     let aside = slope * behind;
@@ -356,6 +409,8 @@ struct AxisTable {
     weights: Vec<Tap>,
     /// Weights in lattice steps, as fixed point.
     fixed: Vec<i16>,
+    /// The same for the four channels of a field, along x and along y; empty where there is none.
+    field: [FieldTaps; 2],
     /// Weights of a phase at most.
     stride: usize,
     /// Zeros before and after those of each phase.
@@ -389,8 +444,13 @@ fn near(pixel: i64) -> i32 {
 /// The one definition of a footprint weight, per vox: pixel `i` of a centre at phase `p`.
 #[inline]
 fn weight(profile: &Profile, scale: f64, p: i32, i: i64) -> f64 {
-    let u = (i as f64 + 0.5 - f64::from(p) / f64::from(SUBPIXELS)) / scale;
-    profile.at(u)
+    profile.at(distance(scale, p, i))
+}
+
+/// Distance in vox of the middle of pixel `i` from a centre at phase `p`.
+#[inline]
+fn distance(scale: f64, p: i32, i: i64) -> f64 {
+    (i as f64 + 0.5 - f64::from(p) / f64::from(SUBPIXELS)) / scale
 }
 
 /// First pixel of a footprint, relative to the one that holds the centre: as the centre goes
@@ -448,7 +508,7 @@ impl Phases {
 
 impl AxisTable {
     /// Weights of `profile` at `scale`, with [`Zeros`] around each phase's.
-    fn new(profile: &Profile, scale: f64, zeros: Zeros) -> Self {
+    fn new(profile: &Profile, scale: f64, zeros: Zeros, field: bool) -> Self {
         let radius = profile.radius * scale;
         let spans: Vec<(i64, i64)> = (0..SUBPIXELS).map(|p| reach(p, radius)).collect();
         let firsts: Vec<i32> = spans.iter().map(|s| near(s.0)).collect();
@@ -462,12 +522,25 @@ impl AxisTable {
         let reach = spans.iter().map(far).max().unwrap_or(0);
         let n = (stride + 2 * margin) * SUBPIXELS as usize;
         let (weights, fixed_weights) = (vec![Tap::default(); n], vec![0; n]);
-        let mut table =
-            AxisTable { first, count, weights, fixed: fixed_weights, stride, margin, reach };
+        let taps = || if field { FieldTaps::zeros(n) } else { FieldTaps::default() };
+        let mut table = AxisTable {
+            first,
+            count,
+            weights,
+            fixed: fixed_weights,
+            field: [taps(), taps()],
+            stride,
+            margin,
+            reach,
+        };
         for p in 0..SUBPIXELS as usize {
             let begin = table.phases().begin(p);
             for t in 0..table.count[p] as usize {
                 let w = weight(profile, scale, p as i32, spans[p].0 + t as i64);
+                let u = distance(scale, p as i32, spans[p].0 + t as i64);
+                for (axis, taps) in table.field.iter_mut().enumerate().filter(|_| field) {
+                    taps.put(begin + t, axis, profile, u);
+                }
                 table.weights[begin + t] = Tap::new(w as f32);
                 table.fixed[begin + t] = fixed(w * profile.spread);
             }
@@ -498,8 +571,8 @@ struct Tables {
 }
 
 impl Tables {
-    fn new(x: &Profile, y: &Profile, scale: f64, zeros: Zeros) -> Self {
-        let along = |profile| AxisTable::new(profile, scale, zeros);
+    fn new(x: &Profile, y: &Profile, scale: f64, zeros: Zeros, field: bool) -> Self {
+        let along = |profile| AxisTable::new(profile, scale, zeros, field);
         Tables { x: along(x), y: (x != y).then(|| along(y)) }
     }
 
@@ -524,6 +597,8 @@ pub struct Footprints {
     last: i32,
     view: View,
     shelf: Arc<Shelf>,
+    /// Whether tables have the weights of a field's four channels.
+    field: bool,
 }
 
 /// Tables that all frames of one scene share. A scene has one kernel: along a turn a sheet's scale
@@ -542,8 +617,8 @@ type Cut = ([u64; 2], bool);
 /// A profile and a thickness, as bits, phases of a sheet, and whether slivers are given away.
 type Deep = ([u64; 4], i32, bool);
 
-/// Two profiles and a scale, as bits, and zeros around weights.
-type Key = ([u64; 7], Zeros);
+/// Two profiles and a scale, as bits, zeros around weights, and whether there are those of fields.
+type Key = ([u64; 7], Zeros, bool);
 
 /// Tables that a shelf keeps: some 1000 are 14 MB at two pixels a vox. A turn of a volume of 256
 /// voxels a side has 450. A shelf that is full is cleared: what frames use they hold themselves.
@@ -560,11 +635,11 @@ fn rounded(scale: f64) -> f64 {
 }
 
 impl Shelf {
-    fn get(&self, x: &Profile, y: &Profile, scale: f64, zeros: Zeros) -> Arc<Tables> {
+    fn get(&self, [x, y]: [&Profile; 2], scale: f64, zeros: Zeros, field: bool) -> Arc<Tables> {
         let profile = |p: &Profile| [p.std, p.radius, p.spread].map(f64::to_bits);
         let ([a, b, c], [d, e, f]) = (profile(x), profile(y));
-        let key = ([a, b, c, d, e, f, scale.to_bits()], zeros);
-        shelved(&self.tables, SHELF, key, || Tables::new(x, y, scale, zeros))
+        let key = ([a, b, c, d, e, f, scale.to_bits()], zeros, field);
+        shelved(&self.tables, SHELF, key, || Tables::new(x, y, scale, zeros, field))
     }
 
     /// Returns [`Sections::new`] from the shelf, made once: it takes 80 us, which is a twentieth of
@@ -579,6 +654,14 @@ impl Shelf {
         let bits = [profile.std, profile.radius, profile.spread, thickness].map(f64::to_bits);
         let key = (bits, phases, merged);
         shelved(&self.sections, SECTIONS, key, || Sections::new(profile, thickness, phases, merged))
+    }
+
+    /// Returns [`Sections::planes`] from the shelf.
+    pub fn planes(&self, profile: &Profile, thickness: f64, phases: i32) -> Arc<Sections> {
+        let bits = [profile.std, profile.radius, profile.spread, thickness].map(f64::to_bits);
+        // No sections have so few phases.
+        let key = (bits, -phases, false);
+        shelved(&self.sections, SECTIONS, key, || Sections::planes(profile, thickness, phases))
     }
 
     /// A profile of this deviation and radius, or the whole of what it is cut from, as
@@ -629,6 +712,7 @@ impl Footprints {
         range: SheetRange,
         spread: DVec3,
         shelf: Arc<Shelf>,
+        field: bool,
     ) -> Self {
         let (std, radius) = (view.kernel_std, view.kernel_radius);
         let x = Profile::new(kernel, std.x, radius.x).with_spread(spread.x);
@@ -646,7 +730,7 @@ impl Footprints {
         let kept = taps <= TABLE_TAPS && bytes <= TABLE_BYTES;
         let tables = (0..if kept { sheets } else { 0 }).map(|_| OnceLock::new()).collect();
         let (first, last) = (range.first, range.end - 1);
-        Footprints { x, y, tables, first, last, view: *view, shelf }
+        Footprints { x, y, tables, first, last, view: *view, shelf, field }
     }
 
     /// The last sheet that anything of the volume may reach.
@@ -666,7 +750,7 @@ impl Footprints {
             Projection::Persp { .. } => (self.tables.get((k - self.first) as usize), None),
         };
         let wide = rounded(scale);
-        let make = || self.shelf.get(&self.x, &self.y, wide, zeros);
+        let make = || self.shelf.get([&self.x, &self.y], wide, zeros, self.field);
         let table = slot.map(|t| &**t.get_or_init(make));
         Some(Footprint { scale, wide, table, profiles: [&self.x, &self.y] })
     }
@@ -742,6 +826,41 @@ impl<'a> Footprint<'a> {
         self.window(axis, pos, clip, buffer, row, |w, spread| fixed(w * spread))
     }
 
+    /// Returns the weights of the four channels of a field along `axis` as [`Footprint::weights`]
+    /// does.
+    #[inline(always)]
+    pub(crate) fn field_weights<'b>(
+        &'b self,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<[f32; 4]>,
+    ) -> (i32, &'b [[f32; 4]]) {
+        let row =
+            |t: &'b AxisTable, p: usize| &t.field[axis].floats()[t.phases().begin(p)..][..t.stride];
+        self.field_window(axis, pos, clip, buffer, row, FieldTaps::float_tap)
+    }
+
+    /// Returns [`Footprint::field_weights`] in fixed point: in steps of the lattice, in units of
+    /// 2^-15.
+    #[inline(always)]
+    pub(crate) fn field_weights_fixed<'b>(
+        &'b self,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<[i16; 4]>,
+    ) -> (i32, &'b [[i16; 4]]) {
+        let row =
+            |t: &'b AxisTable, p: usize| &t.field[axis].fixed()[t.phases().begin(p)..][..t.stride];
+        self.field_window(axis, pos, clip, buffer, row, FieldTaps::fixed_tap)
+    }
+
+    /// Weights of a field's channels along `axis` where they are in a table.
+    pub(crate) fn field(&self, axis: usize) -> Option<&'a FieldTaps> {
+        self.table.map(|t| &t.along(axis).field[axis])
+    }
+
     /// All weights along `axis`, where they are in a table; orthographic ones padded, so that a
     /// window that is moved to lie inside a part reads zeros outside.
     pub(crate) fn all(&self, axis: usize) -> Option<&'a [Tap]> {
@@ -760,6 +879,21 @@ impl<'a> Footprint<'a> {
     }
 
     #[inline(always)]
+    fn field_window<'b, W>(
+        &'b self,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<W>,
+        row: impl Fn(&'b AxisTable, usize) -> &'b [W],
+        make: impl Fn(usize, &Profile, f64) -> W,
+    ) -> (i32, &'b [W]) {
+        let (_, p) = split(pos);
+        let at = |profile: &Profile, i| make(axis, profile, distance(self.wide, p, i));
+        self.window_of(axis, pos, clip, buffer, row, at)
+    }
+
+    #[inline(always)]
     fn window<'b, W>(
         &'b self,
         axis: usize,
@@ -768,6 +902,23 @@ impl<'a> Footprint<'a> {
         buffer: &'b mut Vec<W>,
         row: impl Fn(&'b AxisTable, usize) -> &'b [W],
         make: impl Fn(f64, f64) -> W,
+    ) -> (i32, &'b [W]) {
+        let (_, p) = split(pos);
+        let at = |profile: &Profile, i| make(weight(profile, self.wide, p, i), profile.spread);
+        self.window_of(axis, pos, (lo, hi), buffer, row, at)
+    }
+
+    /// Weights along one axis from a table's row, or made by `make` from the profile and the pixel,
+    /// which counts from the one that holds the centre.
+    #[inline(always)]
+    fn window_of<'b, W>(
+        &'b self,
+        axis: usize,
+        pos: i64,
+        (lo, hi): (i32, i32),
+        buffer: &'b mut Vec<W>,
+        row: impl Fn(&'b AxisTable, usize) -> &'b [W],
+        make: impl Fn(&Profile, i64) -> W,
     ) -> (i32, &'b [W]) {
         let (first, end) = self.extent(axis, pos);
         let (from, to) = (first.max(lo), end.min(hi));
@@ -782,9 +933,8 @@ impl<'a> Footprint<'a> {
             }
             None => {
                 let profile = self.profiles[axis];
-                let at = |i| weight(profile, self.wide, p, i64::from(i) - base);
                 buffer.clear();
-                buffer.extend((from..to).map(|i| make(at(i), profile.spread)));
+                buffer.extend((from..to).map(|i| make(profile, i64::from(i) - base)));
                 (from, &buffer[..])
             }
         }

@@ -3,6 +3,7 @@
 //!
 //! Imports nothing of this crate but itself.
 
+pub mod field_taps;
 pub mod footprint;
 pub mod lattice_rows;
 pub mod positions;

@@ -11,7 +11,7 @@ use slabcast_common::ids::SceneId;
 use slabcast_common::image::{FrameState, Picture};
 use slabcast_common::message::{Counters, SceneSpec};
 use slabcast_common::occlusion::Rect;
-use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
+use slabcast_common::quality::{Classify, Compositing, Kernel, Quality, Sums};
 use slabcast_common::shade::Shading;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, OpacityUnit, TransferFunction};
@@ -178,7 +178,7 @@ fn in_regions(
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 80, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: 120, ..ProptestConfig::default() })]
 
     #[test]
     fn tiles_slabs_and_regions_equal_the_serial_oracle_bit_for_bit(
@@ -203,7 +203,17 @@ proptest! {
         zoom in prop::sample::select(vec![0.3, 1.25, 1.25, 6.0]),
         kernel in prop::sample::select(
             vec![Kernel::Gaussian, Kernel::Gaussian, Kernel::Bspline, Kernel::Tent]),
+        classify in prop::sample::select(vec![Classify::After, Classify::Before]),
     ) {
+        let after = classify == Classify::After;
+        let (thickness, compositing, sums) = match after {
+            false => (thickness, compositing, sums),
+            true => (
+                f64::min(thickness, 1.0),
+                Compositing::Linear,
+                if sums == Sums::F32 { Sums::I32 } else { sums },
+            ),
+        };
         // Blobs: correlated values, with empty space between.
         let hash = |i: u32, j: u32, k: u32| {
             let mut h = seed ^ (u64::from(i / 3) << 40) ^ (u64::from(j / 3) << 20) ^ u64::from(k / 2);
@@ -217,7 +227,8 @@ proptest! {
         });
         v.lattice = Lattice::from_spacing(v.lattice.dims, [1.0, spacing, 1.0]);
         v.lattice.steps[0].y = skew;
-        let quality = Quality { thickness, eps, compositing, sums, kernel, ..Quality::default() };
+        let quality =
+            Quality { thickness, eps, classify, compositing, sums, kernel, ..Quality::default() };
         let camera = Camera {
             to_eye: DVec3::new(azimuth.sin(), azimuth.cos(), tilt),
             up,

@@ -8,6 +8,7 @@ mod planes;
 
 use self::planes::{BLOCK, Lofts, Planes, Window};
 use crate::kernels::composite::{LANES, Row};
+use crate::kernels::field::{FieldSum, Four, planes_of, weighted};
 use crate::kernels::pixel_records::STRIDE;
 use crate::kernels::touched::put;
 use crate::kernels::{Accumulate, Simd, Weight, Work};
@@ -130,7 +131,140 @@ impl<S: Accumulate> Work for RenderGeneral<'_, S> {
             kind.lofts.reset(slots);
             kind.reaching.iter_mut().for_each(Vec::clear);
         }
-        General { part: &part }.render(kind, queues, pixels, io);
+        General { part: &part }.render(SectionSums, kind, queues, pixels, io);
+    }
+}
+
+/// Work that draws one part of a field with any kernel and view.
+pub struct RenderGeneralField<'a, S: FieldSum> {
+    pub(crate) part: Part<'a>,
+    pub(crate) kind: &'a mut Kind<S>,
+    pub(crate) queues: &'a mut Queues,
+    pub(crate) pixels: &'a mut Pixels,
+    pub(crate) io: Io<'a>,
+}
+
+impl<S: FieldSum> Work for RenderGeneralField<'_, S> {
+    type Out = ();
+    #[inline(always)]
+    fn run(self, _: Simd) {
+        let RenderGeneralField { part, kind, queues, pixels, io } = self;
+        kind.planes.reset(part.frame.sections.most() + 1);
+        let planes = FieldPlanes { weights: Default::default() };
+        General { part: &part }.render(planes, kind, queues, pixels, io);
+    }
+}
+
+/// What sheets hold: sections of classified voxels, or planes of a field.
+trait Contents<S: Accumulate> {
+    /// Adds the voxels of `bucket` to their sheets from sheet `k` on.
+    fn splat_all(
+        &mut self,
+        of: &General<'_>,
+        bucket: &[Waiting],
+        k: i32,
+        kind: &mut Kind<S>,
+        state: (&OpenMask, &mut Counters),
+    );
+    /// Composites sheet `k` at some pixels, given by their columns and rows in the picture.
+    fn close_row(
+        &self,
+        part: &Part<'_>,
+        row: &mut Row,
+        at: (&[[i32; 2]; LANES], i32),
+        live: u32,
+    ) -> u32;
+}
+
+/// Sections of classified voxels.
+struct SectionSums;
+
+impl<S: Accumulate> Contents<S> for SectionSums {
+    #[inline(always)]
+    fn splat_all(
+        &mut self,
+        of: &General<'_>,
+        bucket: &[Waiting],
+        k: i32,
+        kind: &mut Kind<S>,
+        (open, counters): (&OpenMask, &mut Counters),
+    ) {
+        of.splat_all(bucket, k, kind, open, counters);
+    }
+
+    #[inline(always)]
+    fn close_row(
+        &self,
+        part: &Part<'_>,
+        row: &mut Row,
+        _: (&[[i32; 2]; LANES], i32),
+        live: u32,
+    ) -> u32 {
+        part.frame.rule.close_row::<S>(row, live)
+    }
+}
+
+/// Planes of a field.
+struct FieldPlanes<S: FieldSum> {
+    /// For weights that are in no table.
+    weights: [Vec<Four<S>>; 2],
+}
+
+impl<S: FieldSum> Contents<S> for FieldPlanes<S> {
+    #[inline(always)]
+    fn splat_all(
+        &mut self,
+        of: &General<'_>,
+        bucket: &[Waiting],
+        k: i32,
+        kind: &mut Kind<S>,
+        (open, counters): (&OpenMask, &mut Counters),
+    ) {
+        let Part { frame, rect, slab, .. } = of.part;
+        let rule = frame.field.as_ref().expect("a field's frame");
+        let [bx, by] = &mut self.weights;
+        for Waiting { brick, voxel, placed } in bucket {
+            let (brick, _) = of.part.brick(*brick as usize);
+            if frame.scene.quality.cull && of.extent(placed).is_none_or(|e| !open.any(&e)) {
+                counters.culled += 1;
+                continue;
+            }
+            let payload = S::payload_of(frame.field_payload(rule, brick, usize::from(*voxel)));
+            if S::is_nothing(payload) {
+                continue;
+            }
+            counters.splatted += 1;
+            let (first, count) = frame.sections.span(placed.z);
+            let planes = planes_of::<S>(&frame.sections, placed.z);
+            for sheet in first.max(k).max(slab.first)..(first + count as i32).min(slab.end) {
+                let Some(f) = frame.footprints.at(sheet) else { continue };
+                let at = frame.screen(placed, sheet, &f);
+                let section = weighted::<S>([payload; 4], planes[(sheet - first) as usize]);
+                let (y0, wy) = S::window(&f, 1, at[1], (rect.y0, rect.y1), by);
+                for (j, wy) in wy.iter().enumerate() {
+                    // Rows of a kernel that leans lie beside each other.
+                    let y = y0 + j as i32;
+                    let along = frame.along_row(at, y);
+                    let (x0, wx) = S::window(&f, 0, along, (rect.x0, rect.x1), bx);
+                    if !wx.is_empty() {
+                        let from = [(x0 - rect.x0) as usize, (y - rect.y0) as usize];
+                        let row = weighted::<S>(section, *wy);
+                        kind.planes.add_field_row(sheet, from, wx, row);
+                    }
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn close_row(
+        &self,
+        part: &Part<'_>,
+        row: &mut Row,
+        at: (&[[i32; 2]; LANES], i32),
+        live: u32,
+    ) -> u32 {
+        part.frame.close_field_row(row, at, live)
     }
 }
 
@@ -142,6 +276,7 @@ impl General<'_> {
     #[inline(always)]
     fn render<S: Accumulate>(
         &self,
+        mut contents: impl Contents<S>,
         kind: &mut Kind<S>,
         queues: &mut Queues,
         pixels: &mut Pixels,
@@ -181,7 +316,7 @@ impl General<'_> {
                     let id = |v: &Waiting| part.brick(v.brick as usize).0.id;
                     carried.sort_unstable_by_key(|v| (sections.first(v.placed.z), id(v), v.voxel));
                 }
-                self.splat_all(&carried, k, kind, &open, counters);
+                contents.splat_all(self, &carried, k, kind, (&open, counters));
                 carried.clear();
                 queues.carried = carried;
             }
@@ -189,7 +324,7 @@ impl General<'_> {
             if float_sums {
                 bucket.sort_unstable_by_key(|v| (part.brick(v.brick as usize).0.id, v.voxel));
             }
-            self.splat_all(&bucket, k, kind, &open, counters);
+            contents.splat_all(self, &bucket, k, kind, (&open, counters));
             bucket.clear();
             queues.buckets[(k - slab.first) as usize] = bucket;
             if let Some(lattice_rows) = &frame.lattice_rows {
@@ -199,7 +334,7 @@ impl General<'_> {
                 }
                 kind.lofts.clear(k);
             }
-            if self.close(k, &kind.planes, &mut open, pixels) {
+            if self.close(&contents, k, &kind.planes, &mut open, pixels) {
                 any_open = open.count() > 0;
             }
             kind.planes.clear(k - 1);
@@ -412,13 +547,14 @@ impl General<'_> {
     #[inline(always)]
     fn close<S: Accumulate>(
         &self,
+        contents: &impl Contents<S>,
         k: i32,
         planes: &Planes<S>,
         open: &mut OpenMask,
         pixels: &mut Pixels,
     ) -> bool {
         const { assert!(LANES == 2 * BLOCK) };
-        let rule = self.part.frame.rule;
+        let rect = self.part.rect;
         let mut mask = planes.touched(k);
         let mut any_shut = false;
         let mut row = Row::default();
@@ -432,17 +568,21 @@ impl General<'_> {
                     continue;
                 }
                 let mut places = [0; LANES];
+                let mut at_pixel = [[0; 2]; LANES];
                 for (lane, place) in places.iter_mut().enumerate() {
                     let at = (y + lane / BLOCK) * STRIDE + x0 + lane % BLOCK;
                     let secant = pixels.secants[at];
                     (row.secant[lane], row.cosine[lane]) = (secant, 1.0 / secant);
                     row.a[lane] = f32::from_bits(pixels.all[at][0]);
                     *place = at as u32;
+                    let [x, y] = [x0 + lane % BLOCK, y + lane / BLOCK];
+                    at_pixel[lane] = [rect.x0 + x as i32, rect.y0 + y as i32];
                 }
                 for half in 0..2 {
                     planes.load(k, (y + half) * PART as usize + x0, &mut row, half * BLOCK);
                 }
-                let shut = rule.close_row::<S>(&mut row, (live[0] | live[1] << BLOCK) as u32);
+                let live = (live[0] | live[1] << BLOCK) as u32;
+                let shut = contents.close_row(self.part, &mut row, (&at_pixel, k), live);
                 put(Simd::plain(), &row, &places, &mut pixels.all);
                 for half in 0..2 {
                     let shut = u64::from(shut >> (half * BLOCK) & 0xff);

@@ -2,6 +2,7 @@
 //! sections; for any kind of sums and any number of sheets.
 
 use crate::kernels::composite::Row;
+use crate::kernels::field::{FieldSum, Four, weighted};
 use crate::kernels::{Accumulate, Pixels, splat};
 use crate::primitives::sizes::LATTICE_ROWS as ROWS;
 use slabcast_common::image::RawSums;
@@ -236,6 +237,28 @@ impl<S: Accumulate> Planes<S> {
         let sheet: &mut Pixels<S> = &mut self.sheets[slot];
         splat(sheet, PART, window.0, window.1, section);
         self.touched.masks[slot] |= blocks(window);
+    }
+
+    /// Adds a row of one plane of a field's voxel to sheet `k`, from column x and row y on.
+    #[inline(always)]
+    pub(crate) fn add_field_row(
+        &mut self,
+        k: i32,
+        [x0, y]: [usize; 2],
+        wx: &[Four<S>],
+        row: Four<S>,
+    ) where
+        S: FieldSum,
+    {
+        let slot = self.touched.slot(k);
+        let to = &mut self.sheets[slot][y * PART + x0..][..wx.len()];
+        for (pixel, &wx) in to.iter_mut().zip(wx) {
+            let term = weighted::<S>(row, wx);
+            *pixel = std::array::from_fn(|c| pixel[c].with(term[c]));
+        }
+        let (bx0, bx1) = (x0 / BLOCK, (x0 + wx.len() - 1) / BLOCK);
+        let touched = (u64::MAX >> (63 - (bx1 - bx0))) << bx0;
+        self.touched.masks[slot] |= touched << (8 * (y / BLOCK));
     }
 
     /// The sums of [`BLOCK`] pixels from `pixel` in sheets k-1, k and k+1, to lanes from `lane`.

@@ -8,6 +8,7 @@
 //! latency, and is the same for every tile, order and culling, since "begins no later" is a
 //! matter of the absolute sheet grid (docs/design/numerics.md, section 1.2).
 
+pub mod field;
 pub mod rows;
 
 use crate::kernels::truncate;

@@ -23,12 +23,14 @@
 //! for those whose kernel leans, `perspective` for most perspective views, and `shared_rows` for
 //! views with a level camera. `Part::draw` picks the fastest that takes the view.
 
+use crate::geometry::field::{self, RenderField};
 use crate::geometry::general::{GeneralScratch, Kind, Queues, RenderGeneral, RenderGeneralField};
 use crate::geometry::open_sheets::Store;
 use crate::geometry::ortho::{self, RenderOrtho};
 use crate::geometry::perspective::{self, Deep, RenderPerspective, RenderPerspectiveSharedRows};
 use crate::geometry::shared_rows::{self, RenderSharedRows};
 use crate::geometry::sheared::{self, RenderSheared};
+use crate::kernels::field::FieldSum;
 use crate::kernels::pixel_records::MOST;
 use crate::kernels::row_records::Tiered;
 use crate::kernels::{Grey, Simd};
@@ -243,14 +245,16 @@ impl<'a> Part<'a> {
         let Scratch { general, whole, pixels, .. } = scratch;
         let GeneralScratch { kinds, queues } = general;
         if part.frame.is_field() {
+            let Whole { shorts, longs, waiting, .. } = whole;
+            let (waiting, io) = (&mut waiting.flat, io);
             match part.frame.scene.quality.sums {
                 Sums::I16 => {
-                    let kind = &mut kinds.shorts;
-                    simd.run(RenderGeneralField { part, kind, queues, pixels, io });
+                    let kind = (&mut kinds.shorts, queues);
+                    part.render_field(simd, shorts, waiting, kind, pixels, io);
                 }
                 _ => {
-                    let kind = &mut kinds.longs;
-                    simd.run(RenderGeneralField { part, kind, queues, pixels, io });
+                    let kind = (&mut kinds.longs, queues);
+                    part.render_field(simd, longs, waiting, kind, pixels, io);
                 }
             }
             return;
@@ -278,6 +282,28 @@ impl<'a> Part<'a> {
                 let (store, waiting) = (&mut whole.longs, &mut whole.waiting);
                 part.render(simd, store, waiting, (&mut kinds.longs, queues), pixels, io);
             }
+        }
+    }
+
+    /// Draws the part of a frame whose sheets hold planes of a field.
+    fn render_field<S: FieldSum>(
+        self,
+        simd: Simd,
+        store: &mut Store<S>,
+        waiting: &mut ortho::Waiting,
+        (kind, queues): (&mut Kind<S>, &mut Queues),
+        pixels: &mut Pixels,
+        io: Io<'_>,
+    ) {
+        let part = self;
+        match (field::accepts(part.frame), part.frame.sections.most()) {
+            (Some(view), 0..=4) => {
+                simd.run(RenderField::<S, 4> { part, view, store, waiting, pixels, io });
+            }
+            (Some(view), _) => {
+                simd.run(RenderField::<S, MOST> { part, view, store, waiting, pixels, io });
+            }
+            (None, _) => simd.run(RenderGeneralField { part, kind, queues, pixels, io }),
         }
     }
 

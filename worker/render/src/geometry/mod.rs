@@ -12,6 +12,7 @@
 //! that does. [`open_sheets`] and [`batch`] are shared by the fast ones.
 
 pub mod batch;
+pub mod field;
 pub mod general;
 pub mod open_sheets;
 pub mod ortho;

@@ -4,13 +4,13 @@
 //! compositing of sheets are here. Touched pixels are known by a bit each. A sheet that closes
 //! reads only the open ones among them, sixteen at a time from wherever they lie.
 
-use crate::kernels::Simd;
 use crate::kernels::composite::rows::close_rows;
 use crate::kernels::composite::{LANES, Row};
 use crate::kernels::pixel_records::{Line, Record, Recorded, STRIDE};
 use crate::kernels::row_records::Tiers;
 use crate::kernels::row_records::{Folded, Shape};
 use crate::kernels::touched::{Places, Some16, column_and_row, put, take, unpack};
+use crate::kernels::{Simd, Work};
 use crate::part::{Io, Part, Pixels, keep_last};
 use crate::primitives::sizes::PART;
 use crate::visibility::open_mask::{OpenMask, doubling};
@@ -351,12 +351,12 @@ impl Sifting {
 #[inline(always)]
 pub fn close_folded<S: Recorded>(
     simd: Simd,
-    folded: &Folded<S>,
+    (folded, k): (&Folded<S>, i32),
     part: &Part<'_>,
     open: &mut OpenMask,
     pixels: &mut Pixels,
 ) -> bool {
-    let mut some = Closing { simd, part, open, pixels, any_shut: false };
+    let mut some = Closing { simd, part, k, open, pixels, any_shut: false };
     some.all::<S>(folded.places(), |i, _, _, row| {
         let (sheets, opacities) = folded.sums(i);
         unpack::<S>(simd, sheets, opacities, row);
@@ -380,18 +380,19 @@ impl<S: Recorded> Closes<S> {
         (&mut self.before, &mut self.was)
     }
 
-    /// Closes the sheet that `slot` of `records` holds at the pixels of `closing`, of those that it
+    /// Closes sheet `k`, which `records` hold, at the pixels of `closing`, of those that it
     /// was `touched` at; whether pixels were shut.
     #[inline(always)]
     fn close<const N: usize>(
         &mut self,
         simd: Simd,
-        (records, slot): (&mut [Record<S, N>], usize),
+        (records, k): (&mut [Record<S, N>], i32),
         (closing, touched): (&Rows, &Rows),
         part: &Part<'_>,
         open: &mut OpenMask,
         pixels: &mut Pixels,
     ) -> bool {
+        let slot = slot::<N>(k);
         self.begin_sheet(closing, touched);
         let Closes { before, places, sifting, .. } = self;
         places.list(simd, closing);
@@ -400,7 +401,7 @@ impl<S: Recorded> Closes<S> {
             places.sift::<S, N>(simd, (records, before), slot);
             sifting.found(n - places.len(), n);
         }
-        let mut some = Closing { simd, part, open, pixels, any_shut: false };
+        let mut some = Closing { simd, part, k, open, pixels, any_shut: false };
         some.all::<S>(places, |_, places, pixels, row| {
             take::<S, N>(simd, (&mut *records, &mut *before), pixels, places, slot, row);
         });
@@ -466,8 +467,14 @@ impl<S: Recorded, const N: usize> Open<S> for Sheets<'_, S, N> {
             *dead |= *closing & !open.row(y);
             *closing &= open.row(y);
         }
-        let records = (&mut *self.records, slot::<N>(k));
-        self.closes.close(self.simd, records, (&closing, &touched), part, open, pixels)
+        self.closes.close(
+            self.simd,
+            (&mut *self.records, k),
+            (&closing, &touched),
+            part,
+            open,
+            pixels,
+        )
     }
 
     #[inline(always)]
@@ -539,10 +546,37 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
     }
 }
 
+/// Composites rows of a field's pixels, compiled by itself and not with all that calls it.
+struct CloseField<'a, 'b, const ROWS: usize> {
+    part: &'a Part<'a>,
+    k: i32,
+    rows: &'a mut [Row; ROWS],
+    places: [Some16<'b>; ROWS],
+    live: [u32; ROWS],
+}
+
+impl<const ROWS: usize> Work for CloseField<'_, '_, ROWS> {
+    type Out = [u32; ROWS];
+    #[inline(always)]
+    fn run(self, _: Simd) -> [u32; ROWS] {
+        let mut shut = [0; ROWS];
+        let CloseField { part, k, rows, places, live } = self;
+        for (i, row) in rows.iter_mut().enumerate() {
+            let pixels = places[i].at().map(|place| {
+                let [x, y] = column_and_row(place);
+                [part.rect.x0 + x as i32, part.rect.y0 + y as i32]
+            });
+            shut[i] = part.frame.close_field_row(row, (&pixels, k), live[i]);
+        }
+        shut
+    }
+}
+
 /// A sheet that is being closed.
 struct Closing<'a> {
     simd: Simd,
     part: &'a Part<'a>,
+    k: i32,
     open: &'a mut OpenMask,
     pixels: &'a mut Pixels,
     any_shut: bool,
@@ -577,7 +611,7 @@ impl Closing<'_> {
         rows: &mut [Row; ROWS],
         places: [Some16<'_>; ROWS],
     ) {
-        let Closing { simd, part, open, pixels, any_shut } = self;
+        let Closing { simd, part, k, open, pixels, any_shut } = self;
         // Where rays are parallel, the rows' secants stay 1.
         if let Projection::Persp { .. } = part.frame.view.projection {
             for (row, places) in rows.iter_mut().zip(places) {
@@ -593,7 +627,11 @@ impl Closing<'_> {
         for (live, places) in live.iter_mut().zip(places) {
             *live = (1 << places.len()) - 1;
         }
-        let shut = close_rows::<S, ROWS>(*simd, &part.frame.rule, rows, live);
+        let shut = if part.frame.is_field() {
+            simd.run(CloseField { part, k: *k, rows, places, live })
+        } else {
+            close_rows::<S, ROWS>(*simd, &part.frame.rule, rows, live)
+        };
         for ((row, places), mut shut) in rows.iter().zip(places).zip(shut) {
             put(*simd, row, &places.at()[..places.len()], &mut pixels.all);
             *any_shut |= shut != 0;

@@ -7,7 +7,7 @@
 
 use crate::kernels::composite::Sum;
 use crate::kernels::pixel_records::{Record, Recorded, STRIDE};
-use crate::kernels::{times, whole};
+use crate::kernels::whole;
 use crate::primitives::field_taps::FieldTaps;
 use crate::primitives::footprint::{Footprint, Sections};
 
@@ -52,7 +52,8 @@ impl FieldSum for i16 {
 
     #[inline(always)]
     fn weighted(term: i16, weight: i16) -> i16 {
-        times(term, weight)
+        // As `times`, in the form that compilers turn into one instruction.
+        ((((i32::from(term) * i32::from(weight)) >> 14) + 1) >> 1) as i16
     }
 
     #[inline(always)]

@@ -1,8 +1,7 @@
 //! What a value looks like: where the transfer function bends, and light.
 //!
 //! Between two points a transfer function is smooth. So what f could look like on a stretch is
-//! known from its ends and the points between: extinctions and colours are monotone from point to
-//! point.
+//! known from what was seen there and from the points between.
 
 use glam::DVec3;
 use slabcast_common::message::SceneSpec;
@@ -11,8 +10,33 @@ use slabcast_common::shade::{Light, Shading};
 use slabcast_common::transfer::{Classifier, Domain};
 use slabcast_common::view::View;
 
-/// Least and most of extinction and the three colours.
-type Span = [[f64; 4]; 2];
+/// Extinction per vox, and that times the three colours.
+pub(super) type Emission = [f64; 4];
+
+/// What a look of extinction and colour emits.
+pub(super) fn emission([sigma, r, g, b]: [f64; 4]) -> Emission {
+    [sigma, sigma * r, sigma * g, sigma * b]
+}
+
+/// What some bends of a transfer function look like.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Bends {
+    pub(super) least: Emission,
+    pub(super) most: Emission,
+    /// Largest difference between the two sides of a bend.
+    pub(super) jump: f64,
+}
+
+impl Bends {
+    fn and(&self, other: &Bends) -> Bends {
+        let (a, b) = (self, other);
+        Bends {
+            least: std::array::from_fn(|c| a.least[c].min(b.least[c])),
+            most: std::array::from_fn(|c| a.most[c].max(b.most[c])),
+            jump: a.jump.max(b.jump),
+        }
+    }
+}
 
 /// A transfer function with its bends.
 #[derive(Debug)]
@@ -25,15 +49,11 @@ pub(super) struct Looks {
     pub(super) sigma_max: f64,
     /// Codes of the transfer function's points, ascending, and the volume's two ends.
     bends: Vec<f64>,
-    /// `spans[l][i]`: of the bends from `i` on, `2^l` of them.
-    spans: Vec<Vec<Span>>,
+    /// `runs[l][i]`: the `2^l` bends from `i` on.
+    runs: Vec<Vec<Bends>>,
     /// How far from a bend its two sides are looked at, in codes; more than the rounding of its
     /// code.
     beside: f64,
-}
-
-fn union(a: Span, b: Span) -> Span {
-    [std::array::from_fn(|c| a[0][c].min(b[0][c])), std::array::from_fn(|c| a[1][c].max(b[1][c]))]
 }
 
 impl Looks {
@@ -46,29 +66,43 @@ impl Looks {
             Domain::Unit if summary.map.scale < 0.0 => hi - x * (hi - lo),
             Domain::Unit => lo + x * (hi - lo),
         };
-        let colours = spec.transfer.colors.iter().map(|p| code_of(p[0]));
-        let opacities = spec.transfer.opacities.iter().map(|p| code_of(p[0]));
-        let mut bends: Vec<f64> = colours.chain(opacities).chain([lo, hi]).collect();
-        bends.retain(|code| (lo..=hi).contains(code));
-        bends.sort_by(f64::total_cmp);
-        bends.dedup();
-        let beside = 1e-10 * lo.abs().max(hi.abs()).max(hi - lo);
-        let span = |&code: &f64| {
-            let at = |code: f64| [of.optics_at(code); 2];
-            union(at(code), union(at(code - beside), at(code + beside)))
+        // Two points at one x make a step.
+        let places = |x: Vec<f64>| {
+            let step = |i: usize| [i.wrapping_sub(1), i + 1].iter().any(|&n| x.get(n) == x.get(i));
+            (0..x.len()).map(|i| (code_of(x[i]), step(i))).collect::<Vec<_>>()
         };
-        let mut spans: Vec<Vec<Span>> = vec![bends.iter().map(span).collect()];
-        let mut reach = 1;
-        while 2 * reach <= bends.len() {
-            let last = &spans[spans.len() - 1];
-            let next = (0..=bends.len() - 2 * reach).map(|i| union(last[i], last[i + reach]));
+        let mut points = places(spec.transfer.colors.iter().map(|p| p[0]).collect());
+        points.extend(places(spec.transfer.opacities.iter().map(|p| p[0]).collect()));
+        points.extend([(lo, false), (hi, false)]);
+        points.retain(|(code, _)| (lo..=hi).contains(code));
+        points.sort_by(|a, b| a.0.total_cmp(&b.0));
+        points.dedup_by(|next, kept| {
+            let one = next.0 == kept.0;
+            kept.1 |= one && next.1;
+            one
+        });
+        let beside = 1e-10 * lo.abs().max(hi.abs()).max(hi - lo);
+        let bend = |&(code, step): &(f64, bool)| {
+            let at = |code: f64| emission(of.optics_at(code));
+            let (before, on, behind) = (at(code - beside), at(code), at(code + beside));
+            let one = |e: Emission| Bends { least: e, most: e, jump: 0.0 };
+            let jump = (0..4).map(|c| (behind[c] - before[c]).abs()).fold(0.0, f64::max);
+            let jump = if step { jump } else { 0.0 };
+            Bends { jump, ..one(before).and(&one(on)).and(&one(behind)) }
+        };
+        let mut runs: Vec<Vec<Bends>> = vec![points.iter().map(bend).collect()];
+        let mut length = 1;
+        while 2 * length <= points.len() {
+            let last = &runs[runs.len() - 1];
+            let next = (0..=points.len() - 2 * length).map(|i| last[i].and(&last[i + length]));
             let next = next.collect();
-            spans.push(next);
-            reach *= 2;
+            runs.push(next);
+            length *= 2;
         }
-        let mut looks =
-            Looks { of, min_code: lo, max_code: hi, sigma_max: 0.0, bends, spans, beside };
-        looks.sigma_max = looks.bends(lo, hi).map_or(0.0, |[_, most]| most[0]);
+        let bends = points.iter().map(|point| point.0).collect();
+        let (min_code, max_code) = (lo, hi);
+        let mut looks = Looks { of, min_code, max_code, sigma_max: 0.0, bends, runs, beside };
+        looks.sigma_max = looks.bends(lo, hi).map_or(0.0, |bends| bends.most[0]);
         looks
     }
 
@@ -78,13 +112,13 @@ impl Looks {
         self.of.optics_at(code)
     }
 
-    /// What bends between two codes look like; `None` if there are none.
-    pub(super) fn bends(&self, lo: f64, hi: f64) -> Option<Span> {
+    /// What the bends between two codes look like; `None` if there are none.
+    pub(super) fn bends(&self, lo: f64, hi: f64) -> Option<Bends> {
         let from = self.bends.partition_point(|&b| b < lo - self.beside);
         let to = self.bends.partition_point(|&b| b <= hi + self.beside);
         let level = to.checked_sub(from)?.checked_ilog2()?;
-        let level_spans = &self.spans[level as usize];
-        Some(union(level_spans[from], level_spans[to - (1 << level)]))
+        let runs = &self.runs[level as usize];
+        Some(runs[from].and(&runs[to - (1 << level)]))
     }
 
     /// Whether anything between two codes is visible.
@@ -92,7 +126,7 @@ impl Looks {
         let (lo, hi) = (lo - self.beside, hi + self.beside);
         self.at(lo)[0] > 0.0
             || self.at(hi)[0] > 0.0
-            || self.bends(lo, hi).is_some_and(|[_, most]| most[0] > 0.0)
+            || self.bends(lo, hi).is_some_and(|bends| bends.most[0] > 0.0)
     }
 }
 

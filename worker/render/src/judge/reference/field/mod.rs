@@ -44,7 +44,7 @@ use super::quadrature::{DEEP, Gauss, HALVINGS, Light, Panel};
 use super::upright;
 use blocks::Blocks;
 use glam::{DMat3, DVec3};
-use looks::{Lamp, Looks};
+use looks::{Emission, Lamp, Looks, emission};
 use slabcast_common::brick::{Brick, BrickGrid, local_position};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::view::{NEAR, Projection, View};
@@ -54,10 +54,18 @@ use sums::{Line, Near};
 /// Where halving ends: two levels agree to this on a panel, as a share of the opacity so far.
 const TOLERANCE: f64 = 1e-6;
 
+/// Opacity so far, as a share of what a vox of the largest extinction has (at most 1 - 1/e), below
+/// which the tolerance falls no further.
+const FAINT: f64 = 1e-3;
+
 /// A panel is halved for as long as it may hide this much opacity, as a share of the opacity so
 /// far, in a bend of the transfer function that no node has seen. Nodes need to see no more than
 /// the flank of a spike for two levels to disagree, so this may be coarser than the tolerance.
-const HIDDEN: f64 = 2e-4;
+const UNSEEN: f64 = 2e-4;
+
+/// Two levels agree on a jump by chance where it lies between the middle nodes of both. Those are
+/// 0.07 of a panel apart, so they may both be wrong by half of that.
+const JUMP: f64 = 0.035;
 
 /// Length of a panel before it is halved, in lattice steps along the kernel's axis that the ray
 /// crosses fastest.
@@ -213,7 +221,7 @@ impl FieldReference {
             _ => rgb,
         };
         let sigma = sigma * of.secant;
-        Node { f, look, sums: [sigma, sigma * r, sigma * g, sigma * b] }
+        Node { f, unlit: emission(look), sums: [sigma, sigma * r, sigma * g, sigma * b] }
     }
 
     fn part(&self, of: &Stretch, z: f64, h: f64) -> Part {
@@ -237,10 +245,13 @@ impl FieldReference {
             let joined = front.light[c] + behind * back.light[c];
             off = off.max((joined - whole.panel.light[c]).abs());
         }
+        let [unseen, jump] = self.hidden(&parts, h * of.secant);
+        off = off.max(jump * JUMP);
+        // Where nearly nothing was seen yet, a share of it would be less than any picture needs.
         let opacity = -libm::expm1(-(sum.depth + depth));
-        let least = opacity.max(-libm::expm1(-self.looks.sigma_max.min(1.0)));
-        let agree = open * off <= self.tolerance * opacity
-            && open * self.hidden(&parts, h * of.secant) <= HIDDEN * least;
+        let one_vox = -libm::expm1(-self.looks.sigma_max.min(1.0));
+        let agree = open * off <= self.tolerance * opacity.max(FAINT * one_vox)
+            && open * unseen <= UNSEEN * opacity.max(one_vox);
         if agree || left == 0 {
             for part in &parts {
                 sum.add(&part.panel);
@@ -254,21 +265,21 @@ impl FieldReference {
         }
     }
 
-    /// How much opacity, or light, could be wrong on a panel of `length` vox because f passes a
-    /// bend of the transfer function between the nodes, and looks there as at none of them.
-    fn hidden(&self, parts: &[Part; 2], length: f64) -> f64 {
+    /// How much opacity or light a panel of `length` vox can hide because f passes a bend of the
+    /// transfer function: where it looks there as at no node, and where it jumps.
+    fn hidden(&self, parts: &[Part; 2], length: f64) -> [f64; 2] {
         let (n, nodes) = (8, [&parts[0].nodes, &parts[1].nodes]);
         let node = |i: usize| &nodes[i / 4][i % 4];
         let (mut lo, mut hi) = (f64::INFINITY, f64::NEG_INFINITY);
         let (mut least, mut most) = ([f64::INFINITY; 4], [f64::NEG_INFINITY; 4]);
         let mut bent = 0.0f64;
         for i in 0..n {
-            let Node { f, look, .. } = *node(i);
+            let Node { f, unlit, .. } = *node(i);
             if f.is_nan() {
                 continue;
             }
             for c in 0..4 {
-                (least[c], most[c]) = (least[c].min(look[c]), most[c].max(look[c]));
+                (least[c], most[c]) = (least[c].min(unlit[c]), most[c].max(unlit[c]));
             }
             (lo, hi) = (lo.min(f), hi.max(f));
             if i > 0 && i + 1 < n {
@@ -283,13 +294,10 @@ impl FieldReference {
             let end = node(end).f * 1.27 - node(next).f * 0.27;
             (lo, hi) = (lo.min(end), hi.max(end));
         }
-        let Some([bend_least, bend_most]) = self.looks.bends(lo - bent, hi + bent) else {
-            return 0.0;
-        };
-        let unseen = |c: usize| (bend_most[c] - most[c]).max(least[c] - bend_least[c]).max(0.0);
-        let sigma = unseen(0) * length;
-        let colour = unseen(1).max(unseen(2)).max(unseen(3));
-        (sigma + colour * (most[0].max(0.0) * length)).min(1.0)
+        let Some(bends) = self.looks.bends(lo - bent, hi + bent) else { return [0.0; 2] };
+        let unseen = |c: usize| (bends.most[c] - most[c]).max(least[c] - bends.least[c]);
+        let unseen = (0..4).map(unseen).fold(0.0, f64::max);
+        [unseen, bends.jump].map(|e| (e * length).min(1.0))
     }
 }
 
@@ -306,8 +314,8 @@ struct Stretch<'a> {
 struct Node {
     /// The field.
     f: f64,
-    /// Extinction per vox and colour, unlit: lights know no bends of the transfer function.
-    look: [f64; 4],
+    /// Without light, which knows no bends of the transfer function.
+    unlit: Emission,
     /// Extinction and emission per unit of z, lit.
     sums: [f64; 4],
 }

@@ -150,8 +150,7 @@ impl FieldReference {
     pub fn gradient_at(&self, eye: DVec3) -> DVec3 {
         let (line, mut near) = (self.through(eye), Vec::new());
         self.gather(&line, 0.0, 0.0, &mut near);
-        let f = self.value(&near, &line, 0.0);
-        self.gradient(&near, &line, 0.0, f)
+        self.with_gradient(&near, &line, 0.0).1
     }
 
     /// Returns the limit at pixel (x, y), counted from the top left: linear premultiplied RGBA.
@@ -211,13 +210,14 @@ impl FieldReference {
     }
 
     fn node(&self, of: &Stretch, z: f64) -> Node {
-        let f = self.value(of.near, of.line, z);
+        let (f, gradient) = match self.lamp {
+            Some(_) => self.with_gradient(of.near, of.line, z),
+            None => (self.value(of.near, of.line, z), DVec3::ZERO),
+        };
         let look = self.looks.at(f);
         let [sigma, rgb @ ..] = look;
         let [r, g, b] = match &self.lamp {
-            Some(lamp) if sigma > 0.0 => {
-                lamp.light(rgb, self.gradient(of.near, of.line, z, f), of.to_eye)
-            }
+            Some(lamp) if sigma > 0.0 => lamp.light(rgb, gradient, of.to_eye),
             _ => rgb,
         };
         let sigma = sigma * of.secant;

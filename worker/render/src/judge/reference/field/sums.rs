@@ -25,8 +25,9 @@ pub(super) struct Near {
     /// Own coordinates of the line at z = 0 less the voxel's.
     at: DVec3,
     pub(super) code: f64,
-    /// Of parallel lines the two profiles across, which are the same all along.
-    across: f64,
+    /// Of parallel lines the product of the two profiles across, which is the same all along, and
+    /// its two derivatives.
+    across: [f64; 3],
 }
 
 impl FieldReference {
@@ -74,10 +75,11 @@ impl FieldReference {
                         continue;
                     }
                     let at = line.at - (row + m.x_axis * i as f64);
-                    let mut across = 1.0;
+                    let mut across = [0.0; 3];
                     if line.parallel {
-                        across = self.kernel.at(at.x) * self.kernel.at(at.y);
-                        if across <= 0.0 {
+                        let [[x, dx], [y, dy]] = [at.x, at.y].map(|u| self.kernel.with_slope(u));
+                        across = [x * y, dx * y, x * dy];
+                        if across[0] <= 0.0 {
                             continue;
                         }
                     }
@@ -100,7 +102,7 @@ impl FieldReference {
                 continue;
             }
             w *= if line.parallel {
-                v.across
+                v.across[0]
             } else {
                 let (x, y) = (v.at.x + line.slope.x * z, v.at.y + line.slope.y * z);
                 kernel.at(x) * kernel.at(y)
@@ -111,19 +113,38 @@ impl FieldReference {
         if all > 0.0 { base + sum / all } else { f64::NAN }
     }
 
-    /// The gradient in eye axes, per vox, of the field at depth `z` of a line, where it is `f`.
+    /// The field, and its gradient in eye axes per vox, at depth `z` of a line.
     ///
-    /// Of `sum w v / sum w` it is `sum w' (v - f) / sum w`.
+    /// Of `sum w v / sum w` the derivative is `(sum w' v - f sum w') / sum w`.
     #[inline]
-    pub(super) fn gradient(&self, near: &[Near], line: &Line, z: f64, f: f64) -> DVec3 {
-        let (mut all, mut sum) = (0.0, DVec3::ZERO);
+    pub(super) fn with_gradient(&self, near: &[Near], line: &Line, z: f64) -> (f64, DVec3) {
+        let kernel = &self.kernel;
+        let base = near.first().map_or(f64::NAN, |v| v.code);
+        let (mut all, mut sum) = (0.0, 0.0);
+        let (mut all_slopes, mut slopes) = (DVec3::ZERO, DVec3::ZERO);
         for v in near {
-            let at = v.at + line.slope * z;
-            let [[x, dx], [y, dy], [w, dw]] = at.to_array().map(|u| self.kernel.with_slope(u));
-            all += x * y * w;
-            sum += DVec3::new(dx * y * w, x * dy * w, x * y * dw) * (v.code - f);
+            let [w, dw] = kernel.with_slope(v.at.z + line.slope.z * z);
+            if w <= 0.0 {
+                continue;
+            }
+            let [xy, dx, dy] = if line.parallel {
+                v.across
+            } else {
+                let [x, dx] = kernel.with_slope(v.at.x + line.slope.x * z);
+                let [y, dy] = kernel.with_slope(v.at.y + line.slope.y * z);
+                [x * y, dx * y, x * dy]
+            };
+            let (code, slope) = (v.code - base, DVec3::new(dx * w, dy * w, xy * dw));
+            all += xy * w;
+            sum += xy * w * code;
+            all_slopes += slope;
+            slopes += slope * code;
         }
+        if all <= 0.0 {
+            return (f64::NAN, DVec3::NAN);
+        }
+        let f = sum / all;
         // d/d eye = (d own / d eye)^T d/d own.
-        self.own_from_eye.transpose() * (sum / all)
+        (base + f, self.own_from_eye.transpose() * ((slopes - all_slopes * f) / all))
     }
 }

@@ -19,9 +19,10 @@
 //! -0.5 to n - 0.5, nor in front of the near plane.
 //!
 //! The rules are plain, so the work is in finding what a ray could miss. A transfer function may
-//! jump, or be a spike that f passes within a hundredth of a vox. [`looks`] knows where it bends:
-//! a grid of blocks says where f could be visible at all ([`blocks`]), and a panel is halved for as
-//! long as f may pass a bend on it whose look no node has seen.
+//! jump, or be a spike that f passes within a hundredth of a vox. So a grid of blocks says where f
+//! could be visible at all ([`blocks`]), and where the transfer function bends is known
+//! ([`looks`]): a panel is halved for as long as f may pass a bend on it whose look no node has
+//! seen.
 //!
 //! *Light.* With e the direction to the eye and g the gradient (eye axes, codes per vox), the
 //! normal is that of `side g + e range / 1020`, where `side` is the sign of g.e. So a surface is
@@ -34,6 +35,10 @@
 //! **Missing:** opacity that gradients modulate. A transfer function's `gradient_opacity` is
 //! ignored. All voxels are kept in one array of 4 bytes each (codes are of 8 or 16 bits or f32, so
 //! f32 has them exactly), 64 MiB for 256^3: too much for the largest volumes.
+//!
+//! The price, in seconds on one core for 1000 pixels of 512x512 of a volume of 256^3: 0.5 (mri256,
+//! opaque skin, orthographic), 0.7 (aneurism, vessels, perspective), 13 (mri256, lit and
+//! translucent all over, perspective). Before, 0.5 to make the array and the blocks.
 
 mod blocks;
 mod looks;
@@ -52,15 +57,20 @@ use std::sync::Arc;
 use sums::{Line, Near};
 
 /// Where halving ends: two levels agree to this on a panel, as a share of the opacity so far.
+/// Against 1e-8 pixels are then off by 1e-4 to 5e-4/255 (RMSE; at most 0.005), 200 pixels of
+/// mri256 and aneurism. Ten times as much makes 1e-3/255 more (at most 0.008) for half the time;
+/// 1e-8 takes 3 to 7 times as long.
 const TOLERANCE: f64 = 1e-6;
 
 /// Opacity so far, as a share of what a vox of the largest extinction has (at most 1 - 1/e), below
-/// which the tolerance falls no further.
+/// which the tolerance falls no further. Without it the first faint tissue of a ray is halved
+/// without end, for a share of nearly nothing.
 const FAINT: f64 = 1e-3;
 
 /// A panel is halved for as long as it may hide this much opacity, as a share of the opacity so
 /// far, in a bend of the transfer function that no node has seen. Nodes need to see no more than
 /// the flank of a spike for two levels to disagree, so this may be coarser than the tolerance.
+/// Spikes of 0.002 vox are found by it (a test has them).
 const UNSEEN: f64 = 2e-4;
 
 /// Two levels agree on a jump by chance where it lies between the middle nodes of both. Those are
@@ -68,7 +78,7 @@ const UNSEEN: f64 = 2e-4;
 const JUMP: f64 = 0.035;
 
 /// Length of a panel before it is halved, in lattice steps along the kernel's axis that the ray
-/// crosses fastest.
+/// crosses fastest. About that of the other reference; others were not measured.
 const PANEL: f64 = 0.5;
 
 /// One view of a scene in f64 whose values are classified after reconstruction: the reference for

@@ -64,3 +64,18 @@ fn spline_profiles_are_box_convolutions() {
         }
     }
 }
+
+#[test]
+fn profile_slope_is_the_derivative_of_the_profile() {
+    for kernel in [Kernel::Gaussian, Kernel::Bspline, Kernel::Tent] {
+        let p = Profile::new(kernel, 0.6, 2.0);
+        let h = 1e-6;
+        for i in -230..=230 {
+            let u = f64::from(i) * 0.01 + 0.003;
+            let [value, slope] = p.with_slope(u);
+            let want = (p.at(u + h) - p.at(u - h)) / (2.0 * h);
+            assert!((slope - want).abs() < 1e-8, "{kernel:?} {u}: {slope} {want}");
+            assert_eq!(value, p.at(u));
+        }
+    }
+}

@@ -20,6 +20,9 @@
 //! The limit is that of the model, with its kernel as it is. What the kernel's cut and its ripple
 //! cost, two more references say: [`Reference::without_truncation`], [`Reference::without_ripple`].
 //!
+//! All that is the limit of [`Classify::Before`](slabcast_common::quality::Classify::Before). Where
+//! values are reconstructed first, [`FieldReference`] judges.
+//!
 //! The price: 4096 pixels of mri256 at 512x512 take from half a second (opaque) to about ten
 //! (translucent, in perspective) on two cores. So one takes a [`stratified`] sample of a picture
 //! and lets [`ErrorFigures`] say how far off it is. Nothing is shared between pixels; callers
@@ -29,6 +32,7 @@
 //! here is then in coordinates that lean along, where it is a product of three profiles again and
 //! rays are straight still (`upright`).
 
+mod field;
 mod figures;
 mod ideal;
 #[doc(hidden)]
@@ -41,6 +45,7 @@ mod upright;
 #[doc(hidden)]
 pub mod walk;
 
+pub use field::FieldReference;
 pub use figures::ErrorFigures;
 pub use sample::{grid_cells, stratified};
 pub use sheets::{ReferenceSheet, SectionPlacement, SheetOptions};

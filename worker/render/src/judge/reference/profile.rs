@@ -111,20 +111,36 @@ impl Profile {
     /// Returns the profile `u` vox from its middle, per vox.
     #[inline]
     pub fn at(&self, u: f64) -> f64 {
-        let u = u.abs();
-        if u >= self.radius {
-            return 0.0;
-        }
-        let s = u * self.per_step;
-        let i = s as usize;
-        let t = s - i as f64;
-        // Rounding may take the last place inside to the last node.
-        let (Some([a, da]), Some([b, db])) = (self.table.get(i), self.table.get(i + 1)) else {
-            return 0.0;
-        };
+        let Some(([a, da], [b, db], t)) = self.cell(u.abs()) else { return 0.0 };
         // Hermite's cubic.
         let (c, d) = (b - a - da, db + da - 2.0 * (b - a));
         a + t * (da + t * (c + (t - 1.0) * d))
+    }
+
+    /// Returns the profile `u` vox from its middle, per vox, and its slope there, per vox squared:
+    /// the derivative of what [`Profile::at`] returns. At a kink it is that of the side away from
+    /// the middle.
+    #[inline]
+    pub fn with_slope(&self, u: f64) -> [f64; 2] {
+        let Some(([a, da], [b, db], t)) = self.cell(u.abs()) else { return [0.0; 2] };
+        let (c, d) = (b - a - da, db + da - 2.0 * (b - a));
+        let slope = (da + t * (2.0 * c + (3.0 * t - 2.0) * d)) * self.per_step;
+        [a + t * (da + t * (c + (t - 1.0) * d)), if u < 0.0 { -slope } else { slope }]
+    }
+
+    /// The nodes on both sides of `u`, which is not negative, and its share of the way between.
+    #[inline]
+    fn cell(&self, u: f64) -> Option<([f64; 2], [f64; 2], f64)> {
+        if u >= self.radius {
+            return None;
+        }
+        let s = u * self.per_step;
+        let i = s as usize;
+        // Rounding may take the last place inside to the last node.
+        let (Some(&a), Some(&b)) = (self.table.get(i), self.table.get(i + 1)) else {
+            return None;
+        };
+        Some((a, b, s - i as f64))
     }
 
     /// Returns the integral of the profile from its left edge to `u` vox from its middle, 0 to 1.

@@ -161,7 +161,11 @@ impl Gauss {
     }
 
     pub(super) fn panel(&self, field: &Field, z: f64, h: f64) -> Panel {
-        let at = self.nodes.map(|n| field.at(z + n * h));
+        self.sum(&self.nodes.map(|n| field.at(z + n * h)), h)
+    }
+
+    /// A panel of length `h` from extinction and emission at its nodes.
+    pub(super) fn sum(&self, at: &[[f64; 4]; 4], h: f64) -> Panel {
         let mut p = Panel { depth: 0.0, light: [0.0; 4] };
         for i in 0..4 {
             let before: f64 = (0..4).map(|j| self.up_to[i][j] * at[j][0]).sum::<f64>() * h;

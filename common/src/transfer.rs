@@ -490,12 +490,19 @@ impl Classifier {
     /// of their thickness.
     ///
     /// # Errors
-    /// If integers are requested that can't hold the extinction.
+    /// If integers are requested that can't hold the extinction, or opacity by gradient together
+    /// with classification after reconstruction.
     pub fn choose_sums(&self, quality: &Quality, lattice: &Lattice) -> Result<Sums, InvalidField> {
         let d = quality.thickness;
         let enough = (2.0 * 255.0 * quality.eps).min(3.0) * (d * d).min(1.0);
         let depth = lattice.diagonal() / lattice.vox();
         if quality.classify == Classify::After {
+            if self.is_modulated() {
+                return Err(InvalidField::new(
+                    "gradient_opacity",
+                    "is not drawn with `--classify after` yet; use `--classify before`",
+                ));
+            }
             // Sums hold values: 16 bits round them by some 1/4000 of all codes.
             let support = self.support();
             let visible = match (support.intervals.first(), support.intervals.last()) {

@@ -14,7 +14,7 @@ use slabcast_common::image::{
 };
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::quality::{Quality, Sums};
+use slabcast_common::quality::{Classify, Quality, Sums};
 use slabcast_common::stats::{BrickStats, ErrorStats, FrameStats, LeftOut};
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::Digest32;
@@ -150,6 +150,11 @@ fn error(
     let says = |bound: f64| Some(bound).filter(|&bound| bound < 255.0);
     let max_alpha = Some(max_alpha);
     stats.cutoff.bound = Some(bounds::cutoff(&scene.quality));
+    if scene.quality.classify == Classify::After {
+        // The other bounds are of voxels that are classified before they are splatted.
+        stats.accumulation.bound = Some(bounds::accumulation(view, within));
+        return;
+    }
     stats.quantisation.bound = says(bounds::quantisation(scene, view, within));
     stats.accumulation.bound = Some(bounds::accumulation(view, within));
     stats.rounding.bound = bounds::rounding(scene, view, within, max_alpha).and_then(says);

@@ -7,7 +7,7 @@
 
 use crate::autotune::choose::settle;
 use slabcast_common::message::Counters;
-use slabcast_common::quality::Work;
+use slabcast_common::quality::{Classify, Work};
 use slabcast_render::Frame;
 use slabcast_render::Simd;
 use slabcast_render::judge::reference::{ErrorFigures, Reference, stratified};
@@ -105,14 +105,19 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
         let reference = Reference::new(&scenes.spec(views / 2), view, bricks);
         let mut progress = Progress::new(false).counting("pixel");
         progress.frames(sample.len() as u64, "the reference");
+        let after = quality.classify == Classify::After;
         let truth = direct::map_pixels(&sample, threads, (&mut progress, 0), |[x, y]| {
-            (reference.pixel(x, y), reference.at_same_thickness(x, y))
+            // Planes of a field have no sheets to compare with.
+            let same = (!after).then(|| reference.at_same_thickness(x, y));
+            (reference.pixel(x, y), same)
         });
         progress.end();
-        let (limit, same): (Vec<_>, Vec<_>) = truth.into_iter().unzip();
+        let (limit, same): (Vec<_>, Option<Vec<_>>) =
+            (truth.iter().map(|t| t.0).collect(), truth.iter().map(|t| t.1).collect());
         let pixel = |p: &[u32; 2]| picture.pixels[(p[1] * request.size()[0] + p[0]) as usize];
         let got: Vec<_> = sample.iter().map(pixel).collect();
-        [limit, same].map(|want| ErrorFigures::compare(&got, &want, request.background))
+        let compare = |want: Vec<_>| ErrorFigures::compare(&got, &want, request.background);
+        (compare(limit), same.map(compare))
     });
     let simd = Simd::detect().name();
     if args.json {
@@ -131,8 +136,8 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
             "culled": counters.culled / n,
             // Sums that each voxel adds to: pixels, and bytes of each. Null if voxels differ.
             "adds": adds.map(|adds| serde_json::json!({ "pixels": adds.pixels, "bytes": adds.bytes })),
-            "limit": errors.as_ref().map(|e| figures(&e[0])),
-            "same_thickness": errors.as_ref().map(|e| figures(&e[1])),
+            "limit": errors.as_ref().map(|e| figures(&e.0)),
+            "same_thickness": errors.as_ref().and_then(|e| e.1.as_ref()).map(figures),
         });
         return say(&format!("{json}\n"));
     }
@@ -145,13 +150,16 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
         counters.splatted / n,
         counters.culled / n,
     );
-    if let Some([limit, same]) = errors {
-        let _ = writeln!(
+    if let Some((limit, same)) = errors {
+        let _ = write!(
             text,
-            "error of the middle view in 1/255: {:.3} (max {:.2}) against the limit, {:.3} (max \
-             {:.2}) at the same thickness",
-            limit.rmse, limit.max, same.rmse, same.max
+            "error of the middle view in 1/255: {:.3} (max {:.2}) against the limit",
+            limit.rmse, limit.max
         );
+        if let Some(same) = same {
+            let _ = write!(text, ", {:.3} (max {:.2}) at the same thickness", same.rmse, same.max);
+        }
+        text.push('\n');
     }
     say(&text)
 }

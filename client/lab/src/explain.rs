@@ -7,6 +7,7 @@
 
 use crate::ablation;
 use crate::single_frame::SingleFrame;
+use slabcast_common::quality::Classify;
 use slabcast_common::volume::ValueMap;
 use slabcast_render::judge::reference::{ReferenceSheet, SheetOptions};
 use slabcast_render::oracle::explain::{PixelExplanation, SectionAtPixel, SheetAtPixel, explain};
@@ -118,6 +119,12 @@ fn explain_pixel(args: &ExplainArgs, pixel: [u32; 2]) -> Result<ExplainedPixel, 
     })?;
     let [x, y] = pixel;
     let quality = scene.spec.quality;
+    if quality.classify == Classify::After {
+        return Err(Fail::usage(
+            "--classify: explain shows sheets of voxels that are classified before they are \
+             splatted; use `--classify before`",
+        ));
+    }
     let explained = explain(&scene.frame(quality), &scene.bricks, pixel, args.voxels);
     let reference = scene.reference();
     let sheets = reference.sheet_by_sheet(x, y, SheetOptions::default());

@@ -192,7 +192,11 @@ fn cut<T: Copy + Into<f64> + Sync>(
             let corner = [x, y, z].map(|n| n * BRICK_EDGE);
             match &near {
                 Some(near) => {
-                    field.collect(corner, &|_| true, &|voxel| near.get(voxel), &mut found)
+                    let inside = |voxel| {
+                        near.get(voxel)
+                            && needs.crop.is_none_or(|c| c.contains(&volume.lattice, voxel))
+                    };
+                    field.collect(corner, &|_| true, &inside, &mut found);
                 }
                 None => {
                     let inside =

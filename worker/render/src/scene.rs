@@ -399,6 +399,7 @@ impl Frame {
     #[inline(always)]
     pub(crate) fn close_field_row(
         &self,
+        simd: Simd,
         row: &mut Row,
         at: (&[[i32; 2]; LANES], i32),
         live: u32,
@@ -406,7 +407,7 @@ impl Frame {
         let (Some(rule), Some(scene)) = (&self.field, &self.scene.field) else {
             unreachable!("a frame whose sheets hold planes")
         };
-        rule.close_row(scene, self.scene.shader.as_ref(), row, at, live)
+        rule.close_row(simd, (scene, self.scene.shader.as_ref()), row, at, live)
     }
 
     /// Returns what voxel `i` of `brick`, at eye coordinates `eye` in vox, adds to a sheet per unit

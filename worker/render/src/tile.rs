@@ -23,9 +23,9 @@
 //! for those whose kernel leans, `perspective` for most perspective views, and `shared_rows` for
 //! views with a level camera. `Part::draw` picks the fastest that takes the view.
 
-use crate::geometry::field::{self, RenderField};
+use crate::geometry::field::{self, RenderField, RenderFieldApart};
 use crate::geometry::general::{GeneralScratch, Kind, Queues, RenderGeneral, RenderGeneralField};
-use crate::geometry::open_sheets::Store;
+use crate::geometry::open_sheets::{self, Store};
 use crate::geometry::ortho::{self, RenderOrtho};
 use crate::geometry::perspective::{self, Deep, RenderPerspective, RenderPerspectiveSharedRows};
 use crate::geometry::shared_rows::{self, RenderSharedRows};
@@ -83,6 +83,7 @@ struct Waiting {
     flat: ortho::Waiting,
     leaning: sheared::Waiting,
     deep: perspective::Waiting,
+    apart: open_sheets::Queues<field::Apart>,
 }
 
 /// Renders the sheets of `slab` on `tile` and returns the tile's pixels and the voxels splatted and
@@ -246,7 +247,6 @@ impl<'a> Part<'a> {
         let GeneralScratch { kinds, queues } = general;
         if part.frame.is_field() {
             let Whole { shorts, longs, waiting, .. } = whole;
-            let (waiting, io) = (&mut waiting.flat, io);
             match part.frame.scene.quality.sums {
                 Sums::I16 => {
                     let kind = (&mut kinds.shorts, queues);
@@ -290,18 +290,27 @@ impl<'a> Part<'a> {
         self,
         simd: Simd,
         store: &mut Store<S>,
-        waiting: &mut ortho::Waiting,
+        waiting: &mut Waiting,
         (kind, queues): (&mut Kind<S>, &mut Queues),
         pixels: &mut Pixels,
         io: Io<'_>,
     ) {
         let part = self;
+        let Waiting { flat: waiting, apart, .. } = waiting;
         match (field::accepts(part.frame), part.frame.sections.most()) {
             (Some(view), 0..=4) => {
                 simd.run(RenderField::<S, 4> { part, view, store, waiting, pixels, io });
             }
             (Some(view), _) => {
                 simd.run(RenderField::<S, MOST> { part, view, store, waiting, pixels, io });
+            }
+            (None, most) if field::accepts_apart(part.frame) => {
+                let queues = apart;
+                if most <= 4 {
+                    simd.run(RenderFieldApart::<S, 4> { part, store, queues, pixels, io });
+                } else {
+                    simd.run(RenderFieldApart::<S, MOST> { part, store, queues, pixels, io });
+                }
             }
             (None, _) => simd.run(RenderGeneralField { part, kind, queues, pixels, io }),
         }

@@ -3,6 +3,7 @@
 //! One test program, since several take longer to build, and one after the other to run:
 //! `cargo test -p slabcast --test commands front` runs a room of it.
 
+mod after;
 mod colour_rule;
 mod colours_and_cameras;
 mod config;

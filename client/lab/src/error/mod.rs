@@ -16,7 +16,7 @@ mod report;
 
 use crate::single_frame::SingleFrame;
 use slabcast_common::image::Picture;
-use slabcast_common::quality::{Quality, Sums};
+use slabcast_common::quality::{Classify, Quality, Sums};
 use slabcast_render::judge::reference::{ErrorFigures, SheetOptions, stratified};
 use slabcast_session::direct;
 use slabcast_session::fail::{Fail, say};
@@ -102,13 +102,14 @@ struct ErrorResult {
     sample: Vec<[u32; 2]>,
     limit: Vec<[f64; 4]>,
     /// Errors against the limit, and against sheets of the same thickness.
-    whole: [Row; 2],
+    whole: Vec<Row>,
     /// Sources of error between picture and limit, which add up to the error against the limit.
-    sources: [Row; 5],
-    /// The two parts of rounding.
-    rounding: [Row; 2],
-    /// Errors of the model, between the limit and an ideal.
-    model: [Row; 2],
+    sources: Vec<Row>,
+    /// The two parts of rounding; none where values are classified after reconstruction.
+    rounding: Vec<Row>,
+    /// Errors of the model, between the limit and an ideal; none where values are classified after
+    /// reconstruction.
+    model: Vec<Row>,
     /// Number of pixels compared for `model`.
     sampled_model: usize,
     drawn: Duration,
@@ -150,6 +151,85 @@ fn any_shut(picture: &Picture, eps: f64) -> bool {
 fn measure(args: &ErrorArgs) -> Result<ErrorResult, Fail> {
     let threads = args.threads.count();
     let scene = SingleFrame::read(&args.of, threads, |_| Ok(()))?;
+    match scene.spec.quality.classify {
+        Classify::Before => measure_before(args, scene, threads),
+        Classify::After => measure_after(args, scene, threads),
+    }
+}
+
+/// Thickness of the sheets, over that of the picture, against which its planes are compared.
+const THIN: f64 = 8.0;
+
+/// Compares a picture of reconstructed values: cut-off and quantisation by pictures without them,
+/// planes by thinner ones, and all else by the limit.
+fn measure_after(
+    args: &ErrorArgs,
+    scene: SingleFrame,
+    threads: usize,
+) -> Result<ErrorResult, Fail> {
+    let size = scene.view.size;
+    let mut progress = Progress::new(false).counting("pixel");
+    let began = Instant::now();
+    progress.phase("drawing");
+    let quality = scene.spec.quality;
+    let picture = scene.draw(quality, threads);
+    let drawn = began.elapsed();
+    let opened = any_shut(&picture, quality.eps)
+        .then(|| scene.draw(Quality { eps: 0.0, ..quality }, threads));
+    let opened = opened.as_ref().unwrap_or(&picture);
+    let long = Quality { eps: 0.0, sums: Sums::I32, ..quality };
+    let longs = (quality.sums != Sums::I32).then(|| scene.draw(long, threads));
+    let longs = longs.as_ref().unwrap_or(opened);
+    let thickness = (quality.thickness / THIN).max(1.0 / 64.0);
+    let thin = scene.draw(Quality { thickness, ..long }, threads);
+
+    let sample = stratified(size, args.pixels.count(size), args.seed);
+    progress.frames(sample.len() as u64, &format!("{} pixels of the reference", sample.len()));
+    let reference = scene.reference();
+    let judging = Instant::now();
+    let limit =
+        direct::map_pixels(&sample, threads, (&mut progress, 0), |[x, y]| reference.pixel(x, y));
+    let judged = judging.elapsed();
+    progress.end();
+
+    let sampled = |p: &Picture| -> Vec<[f32; 4]> {
+        sample.iter().map(|&[x, y]| p.pixels[y as usize * size[0] as usize + x as usize]).collect()
+    };
+    let widen = |p: &[[f32; 4]]| -> Vec<[f64; 4]> { p.iter().map(|c| c.map(f64::from)).collect() };
+    let row = |name, what, got: &[[f32; 4]], want: &[[f64; 4]]| Row {
+        name,
+        what,
+        figures: ErrorFigures::compare(got, want, scene.background),
+    };
+    let (got, opened, longs, thin) =
+        (sampled(&picture), sampled(opened), sampled(longs), sampled(&thin));
+    Ok(ErrorResult {
+        whole: vec![row("limit", "against the limit: all of it", &got, &limit)],
+        sources: vec![
+            row("thickness", "planes against planes of an eighth", &longs, &widen(&thin)),
+            row("cutoff", "pixels shut before they are opaque", &got, &widen(&opened)),
+            row("quantisation", "sums of integers", &opened, &widen(&longs)),
+            row("ripple", "of kernel sums, and rounding of positions", &thin, &limit),
+        ],
+        rounding: Vec::new(),
+        model: Vec::new(),
+        sampled_model: 0,
+        total: began.elapsed(),
+        scene,
+        picture,
+        sample,
+        limit,
+        drawn,
+        judged,
+    })
+}
+
+/// Compares a picture of voxels that were classified before they were splatted.
+fn measure_before(
+    args: &ErrorArgs,
+    scene: SingleFrame,
+    threads: usize,
+) -> Result<ErrorResult, Fail> {
     let size = scene.view.size;
 
     let mut progress = Progress::new(false).counting("pixel");
@@ -206,22 +286,22 @@ fn measure(args: &ErrorArgs) -> Result<ErrorResult, Fail> {
     let (got, opened, entire, floated) =
         (sampled(&picture), sampled(opened), sampled(entire), sampled(floated));
     let result = ErrorResult {
-        whole: [
+        whole: vec![
             row("limit", "against the limit: all of it", &got, &limit),
             row("same_thickness", "against the same sheets in f64, nothing shut", &got, &sheets),
         ],
-        sources: [
+        sources: vec![
             row("thickness", "sheets of finite thickness", &narrow(&sheets), &limit),
             row("cutoff", "pixels shut before they are opaque", &got, &widen(&opened)),
             row("slivers", "of kernels, in the sheet beside theirs", &opened, &widen(&entire)),
             row("quantisation", "sums of integers", &entire, &widen(&floated)),
             row("rounding", "of positions and in f32", &floated, &sheets),
         ],
-        rounding: [
+        rounding: vec![
             row("rounding_positions", "of which subpixels and phases", &narrow(&rounded), &sheets),
             row("rounding_arithmetic", "of which f32 and its tables", &floated, &rounded),
         ],
-        model: [
+        model: vec![
             row("truncation", "the kernel's cut", &narrow(&model_limit), &whole_kernel),
             row("ripple", "a constant field is not constant", &narrow(&model_limit), &level),
         ],

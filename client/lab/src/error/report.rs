@@ -43,15 +43,20 @@ pub(super) fn text(result: &ErrorResult) -> String {
         number(plain),
         number(result.whole[0].figures.rmse)
     );
-    out.push_str("beside it, the limit against an ideal\n");
+    if !result.model.is_empty() {
+        out.push_str("beside it, the limit against an ideal\n");
+    }
     result.model.iter().for_each(|r| put(&mut out, r));
     let _ = writeln!(
         out,
-        "{} pixels that are not blank, of {} looked at ({} for truncation and ripple), of {}; \
-         drawn in {}, judged in {}, {} in all",
+        "{} pixels that are not blank, of {} looked at{}, of {}; drawn in {}, judged in {}, {} in \
+         all",
         result.whole[0].figures.n_pixels,
         result.sample.len(),
-        result.sampled_model,
+        match result.sampled_model {
+            0 => String::new(),
+            n => format!(" ({n} for truncation and ripple)"),
+        },
         result.picture.pixels.len(),
         progress::time(result.drawn),
         progress::time(result.judged),

@@ -78,7 +78,8 @@ fn check_all(volume: &Volume, needs: &BrickNeeds) -> BrickStore {
                 let wanted = near(dims[2], k).any(|z| {
                     near(dims[1], j).any(|y| near(dims[0], i).any(|x| visible([x, y, z])))
                 });
-                if !wanted {
+                let inside = needs.crop.is_none_or(|c| c.contains(&volume.lattice, [i, j, k]));
+                if !wanted || !inside {
                     assert!(found.is_none(), "({i}, {j}, {k}) is not relevant");
                     continue;
                 }

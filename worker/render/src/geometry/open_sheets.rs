@@ -533,6 +533,13 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
         }
     }
 
+    /// Notes that a voxel which begins at sheet `k` touches columns `x` and rows `y` of the part.
+    #[inline(always)]
+    pub(crate) fn touch(&mut self, k: i32, x: std::ops::Range<usize>, y: std::ops::Range<usize>) {
+        let bits = (u64::MAX >> (EDGE - x.len())) << x.start;
+        self.added[slot::<N>(k)][y].iter_mut().for_each(|row| *row |= bits);
+    }
+
     /// Returns the pixels that voxels touch which begin at sheets `from` to `k`.
     #[inline(always)]
     pub fn touched(&self, from: i32, k: i32) -> Rows {
@@ -558,15 +565,16 @@ struct CloseField<'a, 'b, const ROWS: usize> {
 impl<const ROWS: usize> Work for CloseField<'_, '_, ROWS> {
     type Out = [u32; ROWS];
     #[inline(always)]
-    fn run(self, _: Simd) -> [u32; ROWS] {
+    fn run(self, simd: Simd) -> [u32; ROWS] {
         let mut shut = [0; ROWS];
         let CloseField { part, k, rows, places, live } = self;
         for (i, row) in rows.iter_mut().enumerate() {
-            let pixels = places[i].at().map(|place| {
+            let mut pixels = [[0; 2]; LANES];
+            for (pixel, &place) in pixels.iter_mut().zip(places[i].at()) {
                 let [x, y] = column_and_row(place);
-                [part.rect.x0 + x as i32, part.rect.y0 + y as i32]
-            });
-            shut[i] = part.frame.close_field_row(row, (&pixels, k), live[i]);
+                *pixel = [part.rect.x0 + x as i32, part.rect.y0 + y as i32];
+            }
+            shut[i] = part.frame.close_field_row(simd, row, (&pixels, k), live[i]);
         }
         shut
     }

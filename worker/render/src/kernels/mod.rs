@@ -176,8 +176,13 @@ pub fn nearest(x: f32) -> i32 {
 pub fn nearest_signed(x: f32) -> i32 {
     let x = if x < LARGEST { x } else { LARGEST };
     let x = if x > -LARGEST { x } else { -LARGEST };
+    // From here up f32s are whole, and a sum with it has no bits left for halves.
+    const WHOLE: f32 = 8_388_608.0;
+    let whole = WHOLE.copysign(x);
+    let rounded = (x + whole) - whole;
+    let rounded = if x.abs() < WHOLE { rounded } else { x };
     // SAFETY: it is -LARGEST to LARGEST; both selects give a bound for NaN.
-    unsafe { x.round_ties_even().to_int_unchecked::<i32>() }
+    unsafe { rounded.to_int_unchecked::<i32>() }
 }
 
 /// 32-bit fixed point: one rounding, to nearest and of two to the even one, when a contribution is

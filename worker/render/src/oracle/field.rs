@@ -4,6 +4,7 @@
 //! As in [`serial`](super::serial) nothing is culled and nothing is tiled. It shares with the tile
 //! renderer the weights and what a pair of planes becomes ([`crate::kernels::composite::field`]).
 
+use crate::kernels::Simd;
 use crate::kernels::composite::field::{FieldRule, FieldScene};
 use crate::kernels::composite::{LANES, Row};
 use crate::kernels::field::{FieldSum, planes_of, weighted};
@@ -112,7 +113,8 @@ fn close<S: FieldSum>(
     row.secant[0] = frame.view.secant(x as i32, y as i32);
     row.a[0] = out.a[i];
     let pixels = [[x as i32, y as i32]; LANES];
-    rule.close_row(scene, frame.scene.shader.as_ref(), &mut row, (&pixels, k), 1);
+    let looks = (scene, frame.scene.shader.as_ref());
+    rule.close_row(Simd::plain(), looks, &mut row, (&pixels, k), 1);
     out.a[i] = row.a[0];
     for (sum, light) in out.colour[i].iter_mut().zip(&row.light) {
         *sum = sum.wrapping_add(light[0]);

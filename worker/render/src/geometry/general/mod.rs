@@ -147,10 +147,10 @@ pub struct RenderGeneralField<'a, S: FieldSum> {
 impl<S: FieldSum> Work for RenderGeneralField<'_, S> {
     type Out = ();
     #[inline(always)]
-    fn run(self, _: Simd) {
+    fn run(self, simd: Simd) {
         let RenderGeneralField { part, kind, queues, pixels, io } = self;
         kind.planes.reset(part.frame.sections.most() + 1);
-        let planes = FieldPlanes { weights: Default::default() };
+        let planes = FieldPlanes { simd, weights: Default::default() };
         General { part: &part }.render(planes, kind, queues, pixels, io);
     }
 }
@@ -206,6 +206,7 @@ impl<S: Accumulate> Contents<S> for SectionSums {
 
 /// Planes of a field.
 struct FieldPlanes<S: FieldSum> {
+    simd: Simd,
     /// For weights that are in no table.
     weights: [Vec<Four<S>>; 2],
 }
@@ -264,7 +265,7 @@ impl<S: FieldSum> Contents<S> for FieldPlanes<S> {
         at: (&[[i32; 2]; LANES], i32),
         live: u32,
     ) -> u32 {
-        part.frame.close_field_row(row, at, live)
+        part.frame.close_field_row(self.simd, row, at, live)
     }
 }
 

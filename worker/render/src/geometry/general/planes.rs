@@ -254,7 +254,9 @@ impl<S: Accumulate> Planes<S> {
         let to = &mut self.sheets[slot][y * PART + x0..][..wx.len()];
         for (pixel, &wx) in to.iter_mut().zip(wx) {
             let term = weighted::<S>(row, wx);
-            *pixel = std::array::from_fn(|c| pixel[c].with(term[c]));
+            for c in 0..4 {
+                pixel[c] = pixel[c].with(term[c]);
+            }
         }
         let (bx0, bx1) = (x0 / BLOCK, (x0 + wx.len() - 1) / BLOCK);
         let touched = (u64::MAX >> (63 - (bx1 - bx0))) << bx0;

@@ -153,7 +153,7 @@ impl Model {
     /// The tables of `frame`; `None` where opacities are added up, whose limit is another.
     pub(crate) fn of(frame: &Frame) -> Option<Model> {
         let (view, q) = (&frame.view, &frame.scene.quality);
-        if q.compositing == Compositing::Paper {
+        if q.compositing == Compositing::Paper || frame.is_field() {
             return None;
         }
         let (std, radius) = (view.kernel_std.to_array(), view.kernel_radius.to_array());

@@ -55,7 +55,7 @@ use profile::Profile;
 use quadrature::{DEEP, Field, Gauss, HALVINGS, Light};
 use slabcast_common::brick::{Brick, BrickGrid, local_position};
 use slabcast_common::message::SceneSpec;
-use slabcast_common::quality::Compositing;
+use slabcast_common::quality::{Classify, Compositing};
 use slabcast_common::shade::Shader;
 use slabcast_common::transfer::Classifier;
 use slabcast_common::view::View;
@@ -97,6 +97,8 @@ pub struct Reference {
     tolerance: f64,
     /// Whether kernel sums are divided by the sum over the endless lattice.
     level: bool,
+    /// The limit of values that are classified after reconstruction, in place of all above.
+    field: Option<FieldReference>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -109,6 +111,8 @@ impl Reference {
     /// Prepares `view` of the scene that `spec` describes; `bricks` are all bricks of the scene, in
     /// any order.
     pub fn new(spec: &SceneSpec, view: View, bricks: &[Arc<Brick>]) -> Reference {
+        let after = spec.quality.classify == Classify::After;
+        let field = after.then(|| FieldReference::new(spec, view, bricks));
         let grid = BrickGrid::new(spec.volume.lattice.dims);
         let [std, radius] = spec.quality.kernel_shape();
         let (spread, lean) = upright::of(&view, std);
@@ -151,6 +155,7 @@ impl Reference {
             rule: Gauss::four_nodes(),
             tolerance: TOLERANCE,
             level: false,
+            field,
         }
     }
 
@@ -158,7 +163,8 @@ impl Reference {
     /// the opacity so far (1e-7 by default): to see whether the integration itself is exact enough.
     #[must_use]
     pub fn with_tolerance(self, tolerance: f64) -> Reference {
-        Reference { tolerance, ..self }
+        let field = self.field.map(|field| field.with_tolerance(tolerance));
+        Reference { tolerance, field, ..self }
     }
 
     /// Returns this reference with the payloads that the sheets of the quality's compositing add
@@ -170,7 +176,12 @@ impl Reference {
     }
 
     /// Returns the limit at pixel (x, y), counted from the top left: linear premultiplied RGBA.
+    /// Where values are classified after reconstruction it is [`FieldReference`]'s; sheets and
+    /// ideals of this reference are those of `before` all the same.
     pub fn pixel(&self, x: u32, y: u32) -> [f64; 4] {
+        if let Some(field) = &self.field {
+            return field.pixel(x, y);
+        }
         let ray = self.ray(x, y);
         let mut walk = Walk::new(self, &ray, &self.looks, self.kernel[2].radius);
         let mut sum = Light::default();

@@ -7,13 +7,14 @@
 //! docs/design/sharp.md has the alternatives and what each costs.
 
 use super::{LANES, Row, fixed_light, select};
+use crate::kernels::{Simd, lut, truncate};
 use glam::{DMat3, DVec3};
 use slabcast_common::kernel::Profile;
 use slabcast_common::math::opacity;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::shade::Shader;
-use slabcast_common::transfer::Classifier;
+use slabcast_common::transfer::{Classifier, OpticalSample};
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::{SampleKind, ValueSummary};
 
@@ -54,11 +55,11 @@ pub struct FieldScene {
     hull: [f64; 2],
     kind: SampleKind,
     /// Extinction per vox and linear colour by cell end.
-    looks: Box<[[f32; 4]]>,
+    looks: Box<[OpticalSample; CELLS + 1]>,
     /// Integrals of extinction, and of extinction times colour, up to each cell's end, in cells.
-    integrals: Box<[[f32; 4]]>,
+    integrals: Box<[OpticalSample; CELLS + 1]>,
     /// Largest extinction per vox up to each cell's end.
-    most: Box<[f32]>,
+    most: Box<[f32; CELLS + 1]>,
 }
 
 impl FieldScene {
@@ -86,21 +87,21 @@ impl FieldScene {
             integrals.push(sum);
         }
         let mut most = 0.0f64;
-        let floats = |x: [f64; 4]| x.map(|x| x as f32);
+        let sample = |[sigma, rgb @ ..]: [f64; 4]| OpticalSample {
+            sigma: sigma as f32,
+            rgb: rgb.map(|c| c as f32),
+        };
         FieldScene {
             background,
             range: [summary.min_code, summary.max_code],
             hull,
             kind: summary.kind,
-            most: looks
-                .iter()
-                .map(|look| {
-                    most = most.max(look[0]);
-                    most as f32
-                })
-                .collect(),
-            looks: looks.into_iter().map(floats).collect(),
-            integrals: integrals.into_iter().map(floats).collect(),
+            most: table(looks.iter().map(|look| {
+                most = most.max(look[0]);
+                most as f32
+            })),
+            looks: table(looks.iter().copied().map(sample)),
+            integrals: table(integrals.into_iter().map(sample)),
         }
     }
 
@@ -108,6 +109,12 @@ impl FieldScene {
     fn span(&self) -> f64 {
         (self.range[1] - self.range[0]).max(f64::MIN_POSITIVE)
     }
+}
+
+/// A table of all cells' ends.
+fn table<T: Copy>(entries: impl Iterator<Item = T>) -> Box<[T; CELLS + 1]> {
+    let all: Box<[T]> = entries.collect();
+    all.try_into().unwrap_or_else(|_| unreachable!("an entry for each end of a cell"))
 }
 
 /// Smallest and largest code between which a value may be visible.
@@ -304,7 +311,7 @@ impl FieldRule {
             plane.value[i] = self.cell[0] + sums[0][i] * self.cell[1];
         }
         for axis in 0..3 {
-            let [x, y, z] = [0, 1, 2].map(|from| self.slopes[from][axis]);
+            let [x, y, z] = [self.slopes[0][axis], self.slopes[1][axis], self.slopes[2][axis]];
             for i in 0..LANES {
                 plane.gradient[axis][i] = sums[1][i] * x + sums[2][i] * y + sums[3][i] * z;
             }
@@ -365,10 +372,11 @@ impl FieldRule {
                 let ey = rays.at[1][i] + rays.slope[1][i] * z;
                 let q = x * ex + y * ey + d * z + faces.from;
                 let step = (x * rays.slope[0][i] + y * rays.slope[1][i] + d) * self.thickness;
-                let step = if step.abs() < 1e-12 { 1e-12 } else { step };
-                let [a, b] = [(faces.lo - q) / step, (faces.hi - q) / step];
-                from[i] = from[i].max(a.min(b));
-                to[i] = to[i].min(a.max(b));
+                let step = select(step.abs() < 1e-12, 1e-12, step);
+                let (a, b) = ((faces.lo - q) / step, (faces.hi - q) / step);
+                let (enter, leave) = (select(a < b, a, b), select(a < b, b, a));
+                from[i] = select(enter > from[i], enter, from[i]);
+                to[i] = select(leave < to[i], leave, to[i]);
             }
         }
         [from, to]
@@ -382,8 +390,8 @@ impl FieldRule {
     #[inline(always)]
     pub fn close_row(
         &self,
-        scene: &FieldScene,
-        shader: Option<&Shader>,
+        simd: Simd,
+        (scene, shader): (&FieldScene, Option<&Shader>),
         row: &mut Row,
         (pixels, k): (&[[i32; 2]; LANES], i32),
         live: u32,
@@ -399,16 +407,17 @@ impl FieldRule {
         let [mut m0, mut m1, mut low, mut high] = [[0.0f32; LANES]; 4];
         let mut visible = 0;
         for i in 0..LANES {
-            let along = |p: &Plane| {
-                let [x, y, z] = [0, 1, 2].map(|axis| p.gradient[axis][i]);
-                h * (x * rays.slope[0][i] + y * rays.slope[1][i] + z)
-            };
-            (m0[i], m1[i]) = (along(&first), along(&last));
+            let ([x0, y0, z0], [x1, y1, z1]) = (&first.gradient, &last.gradient);
+            let (sx, sy) = (rays.slope[0][i], rays.slope[1][i]);
+            m0[i] = h * (x0[i] * sx + y0[i] * sy + z0[i]);
+            m1[i] = h * (x1[i] * sx + y1[i] * sy + z1[i]);
             let (a, b) = (first.value[i], last.value[i]);
             let (p, q) = (a + m0[i] * (1.0 / 3.0), b - m1[i] * (1.0 / 3.0));
-            low[i] = a.min(b).min(p.min(q));
-            high[i] = a.max(b).max(p.max(q));
-            let meets = high[i] > 0.0 && low[i] < CELLS as f32 && row.here[0][i] > 0.0;
+            let (l, m) = (select(a < b, a, b), select(p < q, p, q));
+            low[i] = select(l < m, l, m);
+            let (l, m) = (select(a < b, b, a), select(p < q, q, p));
+            high[i] = select(l < m, m, l);
+            let meets = (high[i] > 0.0) & (low[i] < CELLS as f32) & (row.here[0][i] > 0.0);
             visible |= u32::from(meets) << i;
         }
         visible &= live;
@@ -416,31 +425,29 @@ impl FieldRule {
             return 0;
         }
         let [from, to] = self.clip(&rays, z);
+        let (ends, _) = cells(&high);
+        let mut top = [0.0f32; LANES];
+        for i in 0..LANES {
+            top[i] = scene.most[ends[i] as usize % CELLS + 1];
+        }
         let mut steps = [0.0f32; LANES];
         let mut most = 0.0f32;
         for i in 0..LANES {
-            let top = scene.most[high[i].clamp(0.0, CELLS as f32) as usize];
-            let share = (1.0 - row.a[i]) * (h * top).min(1.0);
-            let dot = |p: &Plane, q: &Plane| {
-                let [x, y, z] = [0, 1, 2].map(|axis| p.gradient[axis][i] * q.gradient[axis][i]);
-                x + y + z + self.flat * self.flat
-            };
-            let both = dot(&first, &first) * dot(&last, &last);
-            let cosine = dot(&first, &last) / both.sqrt();
+            let share = (1.0 - row.a[i]) * select(h * top[i] < 1.0, h * top[i], 1.0);
+            let ([x0, y0, z0], [x1, y1, z1]) = (&first.gradient, &last.gradient);
+            let flat = self.flat * self.flat;
+            let square0 = x0[i] * x0[i] + y0[i] * y0[i] + z0[i] * z0[i] + flat;
+            let square1 = x1[i] * x1[i] + y1[i] * y1[i] + z1[i] * z1[i] + flat;
+            let both = x0[i] * x1[i] + y0[i] * y1[i] + z0[i] * z1[i] + flat;
+            let cosine = both / (square0 * square1).sqrt();
             let range = (high[i] - low[i]) * self.range_per_cell;
             let square = share * (STEPS[0] + STEPS[1] * (1.0 - cosine) + STEPS[2] * range);
-            let m = if square > 16.0 {
-                MOST_STEPS
-            } else if square > 4.0 {
-                4.0
-            } else if square > 1.0 {
-                2.0
-            } else {
-                1.0
-            };
-            let inside = visible >> i & 1 == 1 && to[i] > from[i];
+            let m = select(square > 1.0, 2.0, 1.0);
+            let m = select(square > 4.0, 4.0, m);
+            let m = select(square > 16.0, MOST_STEPS, m);
+            let inside = (visible >> i & 1 == 1) & (to[i] > from[i]);
             steps[i] = select(inside, m, 0.0);
-            most = most.max(steps[i]);
+            most = if steps[i] > most { steps[i] } else { most };
         }
         let mut light = [[0.0f32; LANES]; 3];
         let mut value = [0.0f32; LANES];
@@ -449,6 +456,7 @@ impl FieldRule {
             step[i] = (to[i] - from[i]) / steps[i].max(1.0);
             value[i] = hermite([first.value[i], last.value[i]], [m0[i], m1[i]], from[i]);
         }
+        let mut integral = None;
         for j in 0..most as u32 {
             let [mut middle, mut next, mut active] = [[0.0f32; LANES]; 3];
             for i in 0..LANES {
@@ -457,20 +465,27 @@ impl FieldRule {
                 middle[i] = begin + 0.5 * step[i];
                 next[i] = hermite([first.value[i], last.value[i]], [m0[i], m1[i]], begin + step[i]);
             }
-            let looks = scene.between(&value, &next);
+            let looks = scene.between(simd, [&value, &next], &mut integral);
             value = next;
-            let terms = shader.map(|shader| self.terms(shader, [&first, &last], &middle, &rays));
+            let terms = match shader {
+                Some(shader) => Some(self.terms(shader, [&first, &last], &middle, &rays)),
+                None => None,
+            };
+            let mut seen = [0.0f32; LANES];
             for i in 0..LANES {
                 let tau = looks[0][i] * h * step[i] * row.secant[i] * active[i];
-                let seen = (1.0 - row.a[i]) * opacity(tau);
-                row.a[i] += seen;
-                for c in 0..3 {
+                seen[i] = (1.0 - row.a[i]) * opacity(tau);
+                row.a[i] += seen[i];
+            }
+            for c in 0..3 {
+                for i in 0..LANES {
                     let base = looks[c + 1][i];
                     let lit = match &terms {
-                        Some([lambert, gloss]) => (base * lambert[i] + gloss[i]).clamp(0.0, 1.0),
+                        Some([lambert, gloss]) => base * lambert[i] + gloss[i],
                         None => base,
                     };
-                    light[c][i] += seen * lit;
+                    let lit = select(lit > 0.0, lit, 0.0);
+                    light[c][i] += seen[i] * select(lit < 1.0, lit, 1.0);
                 }
             }
         }
@@ -494,34 +509,40 @@ impl FieldRule {
         rays: &Rays,
     ) -> [[f32; LANES]; 2] {
         let [mut lambert, mut gloss] = [[0.0f32; LANES]; 2];
+        let ([x0, y0, z0], [x1, y1, z1]) = (&first.gradient, &last.gradient);
+        let [mut nx, mut ny, mut nz] = [[0.0f32; LANES]; 3];
+        let [mut ex, mut ey, mut ez] = [[0.0f32; LANES]; 3];
         for i in 0..LANES {
-            let [gx, gy, gz] = [0, 1, 2].map(|axis| {
-                let (a, b) = (first.gradient[axis][i], last.gradient[axis][i]);
-                a + (b - a) * t[i]
-            });
+            let gx = x0[i] + (x1[i] - x0[i]) * t[i];
+            let gy = y0[i] + (y1[i] - y0[i]) * t[i];
+            let gz = z0[i] + (z1[i] - z0[i]) * t[i];
             // To the eye, against the ray.
             let (sx, sy) = (rays.slope[0][i], rays.slope[1][i]);
             let per_length = -1.0 / (sx * sx + sy * sy + 1.0).sqrt();
-            let eye = [sx * per_length, sy * per_length, per_length];
-            let facing = gx * eye[0] + gy * eye[1] + gz * eye[2];
-            let side = if facing < 0.0 { -1.0 } else { 1.0 };
-            let n = [
-                gx * side + self.flat * eye[0],
-                gy * side + self.flat * eye[1],
-                gz * side + self.flat * eye[2],
-            ];
-            let per_length = 1.0 / (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
-            match self.light {
-                None => {
-                    let cosine = (n[0] * eye[0] + n[1] * eye[1] + n[2] * eye[2]) * per_length;
-                    (lambert[i], gloss[i]) = (cosine, cosine);
+            (ex[i], ey[i], ez[i]) = (sx * per_length, sy * per_length, per_length);
+            let facing = gx * ex[i] + gy * ey[i] + gz * ez[i];
+            let side = select(facing < 0.0, -1.0, 1.0);
+            let x = gx * side + self.flat * ex[i];
+            let y = gy * side + self.flat * ey[i];
+            let z = gz * side + self.flat * ez[i];
+            let per_length = 1.0 / (x * x + y * y + z * z).sqrt();
+            (nx[i], ny[i], nz[i]) = (x * per_length, y * per_length, z * per_length);
+        }
+        match self.light {
+            None => {
+                for i in 0..LANES {
+                    lambert[i] = nx[i] * ex[i] + ny[i] * ey[i] + nz[i] * ez[i];
                 }
-                Some(l) => {
-                    let h = [l[0] + eye[0], l[1] + eye[1], l[2] + eye[2]];
-                    let square = h[0] * h[0] + h[1] * h[1] + h[2] * h[2];
-                    let per_half = if square > 1e-12 { per_length / square.sqrt() } else { 0.0 };
-                    lambert[i] = (n[0] * l[0] + n[1] * l[1] + n[2] * l[2]) * per_length;
-                    gloss[i] = (n[0] * h[0] + n[1] * h[1] + n[2] * h[2]) * per_half;
+                gloss = lambert;
+            }
+            Some([lx, ly, lz]) => {
+                for i in 0..LANES {
+                    let (hx, hy, hz) = (lx + ex[i], ly + ey[i], lz + ez[i]);
+                    let square = hx * hx + hy * hy + hz * hz;
+                    let some = square > 1e-12;
+                    let per_half = select(some, 1.0 / select(some, square, 1.0).sqrt(), 0.0);
+                    lambert[i] = nx[i] * lx + ny[i] * ly + nz[i] * lz;
+                    gloss[i] = (nx[i] * hx + ny[i] * hy + nz[i] * hz) * per_half;
                 }
             }
         }
@@ -540,35 +561,90 @@ fn hermite([a, b]: [f32; 2], [da, db]: [f32; 2], t: f32) -> f32 {
 
 impl FieldScene {
     /// Mean extinction per vox, and the mean colour by extinction, of values that go from one cell
-    /// to another.
+    /// to another. `integral` is that up to `from`, if it is known; that up to `to` afterwards.
     #[inline(always)]
-    fn between(&self, from: &[f32; LANES], to: &[f32; LANES]) -> [[f32; LANES]; 4] {
-        let mut out = [[0.0f32; LANES]; 4];
+    fn between(
+        &self,
+        simd: Simd,
+        [from, to]: [&[f32; LANES]; 2],
+        integral: &mut Option<[[f32; LANES]; 4]>,
+    ) -> [[f32; LANES]; 4] {
+        let mut middle = [0.0f32; LANES];
+        let (mut any_far, mut all_far) = (false, true);
         for i in 0..LANES {
-            let (a, b) = (from[i], to[i]);
-            let rise = b - a;
-            let middle = (0.5 * (a + b)).clamp(0.0, CELLS as f32);
-            let look = at(&self.looks, middle);
-            let [p, q] = [a, b].map(|x| at(&self.integrals, x.clamp(0.0, CELLS as f32)));
+            middle[i] = 0.5 * (from[i] + to[i]);
+            let far = (to[i] - from[i]).abs() >= FEW_CELLS;
+            any_far |= far;
+            all_far &= far;
+        }
+        if !any_far {
+            *integral = None;
+            return at(simd, &self.looks, &middle);
+        }
+        let p = match integral {
+            Some(integral) => *integral,
+            None => at(simd, &self.integrals, from),
+        };
+        let q = at(simd, &self.integrals, to);
+        *integral = Some(q);
+        let mut per_sum = [0.0f32; LANES];
+        let mut means = [0.0f32; LANES];
+        let mut every = all_far;
+        for i in 0..LANES {
+            let rise = to[i] - from[i];
             let far = rise.abs() >= FEW_CELLS;
-            let per_rise = 1.0 / if far { rise } else { 1.0 };
-            let sum = q[0] - p[0];
-            let some = sum.abs() > 1e-6;
-            let per_sum = 1.0 / if some { sum } else { 1.0 };
-            out[0][i] = select(far, (sum * per_rise).max(0.0), look[0]);
-            for c in 1..4 {
-                out[c][i] = select(far && some, (q[c] - p[c]) * per_sum, look[c]);
+            let sum = q[0][i] - p[0][i];
+            let some = far & (sum.abs() > 1e-6);
+            every &= some;
+            per_sum[i] = select(some, 1.0 / select(some, sum, 1.0), 0.0);
+            let mean = sum / select(far, rise, 1.0);
+            means[i] = select(mean > 0.0, mean, 0.0);
+        }
+        // Where all go far nobody looks at middles.
+        let mut out = match every {
+            true => [[0.0f32; LANES]; 4],
+            false => at(simd, &self.looks, &middle),
+        };
+        for i in 0..LANES {
+            let far = (to[i] - from[i]).abs() >= FEW_CELLS;
+            out[0][i] = select(far, means[i], out[0][i]);
+        }
+        for c in 1..4 {
+            for i in 0..LANES {
+                let mean = (q[c][i] - p[c][i]) * per_sum[i];
+                out[c][i] = select(per_sum[i] != 0.0, mean, out[c][i]);
             }
         }
         out
     }
 }
 
-/// A table between its entries.
+/// The cells that hold values, the first or the last of those outside, and where in them.
 #[inline(always)]
-fn at(table: &[[f32; 4]], x: f32) -> [f32; 4] {
-    let i = (x as usize).min(CELLS - 1);
-    let t = x - i as f32;
-    let (a, b) = (table[i], table[i + 1]);
-    [0, 1, 2, 3].map(|c| a[c] + (b[c] - a[c]) * t)
+fn cells(x: &[f32; LANES]) -> ([u32; LANES], [f32; LANES]) {
+    let (mut cells, mut shares) = ([0; LANES], [0.0; LANES]);
+    for i in 0..LANES {
+        let x = select(x[i] > 0.0, x[i], 0.0);
+        let x = select(x < CELLS as f32, x, CELLS as f32);
+        let whole = truncate(x);
+        cells[i] = if whole < CELLS as u32 { whole } else { CELLS as u32 - 1 };
+        shares[i] = x - cells[i] as f32;
+    }
+    (cells, shares)
+}
+
+/// A table between its entries, channel by channel.
+#[inline(always)]
+fn at(simd: Simd, table: &[OpticalSample; CELLS + 1], x: &[f32; LANES]) -> [[f32; LANES]; 4] {
+    let (mut cells, shares) = cells(x);
+    let [mut low, mut high] = [[[0.0f32; LANES]; 4]; 2];
+    lut::take(simd, table, &cells, &mut low);
+    cells.iter_mut().for_each(|cell| *cell += 1);
+    lut::take(simd, table, &cells, &mut high);
+    for c in 0..4 {
+        for i in 0..LANES {
+            low[c][i] += (high[c][i] - low[c][i]) * shares[i];
+        }
+    }
+    low
 }

@@ -1,0 +1,60 @@
+//! `--classify after` from the command line.
+
+use crate::program::{good, run, text};
+
+const SHARP: [&str; 6] = ["--classify", "after", "--kernel", "bspline", "--thickness", "0.5"];
+
+#[test]
+fn reconstructed_pictures_are_the_same_bytes_for_any_workers_and_schedule() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let views = ["render", "formula:spheres:40", "--azimuth", "30", "--size", "150x130", "-q"];
+    let draw = |name: &str, more: &[&str]| {
+        let stats = format!("{name}.jsonl");
+        good(dir, &[&views[..], &["-o", name, "--stats", &stats], more].concat());
+        let stats = std::fs::read_to_string(dir.join(stats)).unwrap();
+        let stats: serde_json::Value = serde_json::from_str(&stats).unwrap();
+        stats["pixels_sha256"].as_str().unwrap().to_string()
+    };
+    let sharp = |name: &str, more: &[&str]| draw(name, &[&SHARP[..], more].concat());
+    let one = sharp("one.png", &["--workers", "1", "--threads", "1", "--tile", "128"]);
+    let many = sharp("many.png", &["--workers", "3", "--tile", "16"]);
+    let slabs = sharp("slabs.png", &["--schedule", "slab", "--slabs", "5", "--workers", "2"]);
+    assert_eq!((&many, &slabs), (&one, &one));
+    assert_ne!(one, draw("before.png", &[]), "it is another picture");
+}
+
+#[test]
+fn reconstructed_pictures_are_within_one_255th_of_their_limit() {
+    let dir = tempfile::tempdir().unwrap();
+    let what = ["lab", "error", "formula:spheres:48", "--azimuth", "30", "--size", "160x160"];
+    let said = good(dir.path(), &[&what[..], &SHARP, &["--pixels", "900", "--json"]].concat());
+    let json: serde_json::Value = serde_json::from_str(&said).unwrap();
+    let rmse = |source: &str| json[source]["rmse"].as_f64().unwrap_or_else(|| panic!("{json}"));
+    assert!(rmse("limit") > 0.0 && rmse("limit") < 1.0, "{json}");
+    for source in ["thickness", "cutoff", "quantisation", "ripple"] {
+        assert!(rmse(source) < 1.0, "{source}: {json}");
+    }
+    assert!(json.get("truncation").is_none(), "an error of voxels classified before: {json}");
+}
+
+#[test]
+fn what_reconstruction_does_not_take_is_refused_by_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let render = ["render", "formula:spheres:24", "--azimuth", "0", "--classify", "after"];
+    let cases: [(&[&str], &str); 4] = [
+        (&["--thickness", "2"], "--thickness: 2 is too thick"),
+        (&["--compositing", "paper"], "--compositing: is a rule for voxels"),
+        (&["--sums", "f32"], "--sums: `--classify after` adds whole numbers"),
+        (&["--show", "depth"], "--classify: --show depth shows voxels"),
+    ];
+    for (more, said) in cases {
+        let out = run(dir.path(), &[&render[..], more].concat());
+        assert_eq!(out.status.code(), Some(2), "{more:?}");
+        assert!(text(&out.stderr).contains(said), "{more:?}: {}", text(&out.stderr));
+    }
+    let explain = ["lab", "explain", "formula:spheres:24", "--pixel", "9,9", "--classify", "after"];
+    let out = run(dir.path(), &explain);
+    assert_eq!(out.status.code(), Some(2));
+    assert!(text(&out.stderr).contains("--classify: explain shows"), "{}", text(&out.stderr));
+}

@@ -612,7 +612,7 @@ impl Support {
     /// Returns the codes that must be stored where values are classified after reconstruction: from
     /// the smallest visible code up, or from the largest down, whichever holds fewer of the samples
     /// that `summary` counts. Codes between two visible ones are in it: without them the field
-    /// would fade to [`Support::background`] through the lower one and draw a surface that is not
+    /// would fade to the smallest code through the lower one and draw a surface that is not
     /// there. NaN is never in it.
     #[must_use]
     pub fn filled(&self, summary: &ValueSummary) -> Support {

@@ -428,7 +428,7 @@ impl<S: Tiered, const N: usize> Open<S> for SharedRowsSheets<'_, S, N> {
             let (before, was) = (&mut *before, &mut *was);
             let ends = Ends { open: &some, slots, by_row, before, was, pixels: &pixels.all };
             rows = S::fold(simd, tiers, ends, rows, folded);
-            shut |= close_folded::<S>(simd, (&*folded, k), part, open, pixels);
+            shut |= close_folded::<S>(simd, (*folded, k), part, open, pixels);
         }
         self.clear(slots[0]);
         shut

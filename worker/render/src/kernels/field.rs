@@ -314,6 +314,9 @@ impl FieldSum for i32 {
 /// A payload or a product in its four channels.
 pub type Four<S> = [<S as FieldSum>::Term; 4];
 
+/// Weights by column and slot, and by row and slot.
+pub type WovenWindow<'a, S, const N: usize> = (&'a [[Four<S>; N]], &'a [[Four<S>; N]]);
+
 /// `term * weight`, channel by channel.
 #[inline(always)]
 pub fn weighted<S: FieldSum>(term: Four<S>, weight: Four<S>) -> Four<S> {
@@ -382,7 +385,7 @@ pub fn splat_woven<S: FieldSum, const N: usize>(
     simd: Simd,
     records: &mut [Record<S, N>],
     at: usize,
-    (wx, wy): (&[[Four<S>; N]], &[[Four<S>; N]]),
+    (wx, wy): WovenWindow<'_, S, N>,
     planes: &[Four<S>; N],
 ) {
     for (j, wy) in wy.iter().enumerate() {

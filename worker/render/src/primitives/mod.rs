@@ -8,6 +8,7 @@ pub mod footprint;
 pub mod lattice_rows;
 pub mod positions;
 pub mod profile_table;
+pub mod sections;
 pub mod sizes;
 mod tap;
 

@@ -20,7 +20,7 @@
 //! The limit is that of the model, with its kernel as it is. What the kernel's cut and its ripple
 //! cost, two more references say: [`Reference::without_truncation`], [`Reference::without_ripple`].
 //!
-//! All that is the limit of [`Classify::Before`](slabcast_common::quality::Classify::Before). Where
+//! All that is the limit of [`Classify::Before`]. Where
 //! values are reconstructed first, [`FieldReference`] judges.
 //!
 //! The price: 4096 pixels of mri256 at 512x512 take from half a second (opaque) to about ten

@@ -467,10 +467,7 @@ impl FieldRule {
             }
             let looks = scene.between(simd, [&value, &next], &mut integral);
             value = next;
-            let terms = match shader {
-                Some(shader) => Some(self.terms(shader, [&first, &last], &middle, &rays)),
-                None => None,
-            };
+            let terms = shader.map(|shader| self.terms(shader, [&first, &last], &middle, &rays));
             let mut seen = [0.0f32; LANES];
             for i in 0..LANES {
                 let tau = looks[0][i] * h * step[i] * row.secant[i] * active[i];

@@ -1,5 +1,7 @@
 //! A volume: samples on a lattice that has a place in the world.
 
+mod core;
+
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -295,6 +297,26 @@ pub struct ValueSummary {
     pub nan: u64,
     /// Number of samples that are infinite (drawn as the nearest finite value).
     pub infinite: u64,
+    /// Whether the file says where the patient's right, anterior and superior are: its values are
+    /// then of a body.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub anatomical: bool,
+    /// Where nearly all codes are, if a few, or the padding around a scan, lie so far away that the
+    /// range says nothing of the rest.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub core: Option<ValueCore>,
+}
+
+/// The part of a volume's range that holds nearly all of its samples.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ValueCore {
+    /// Lower end of the part, as a code.
+    pub min_code: f64,
+    /// Upper end of the part, as a code; above `min_code`.
+    pub max_code: f64,
+    /// Counts of finite samples in 256 equal bins between the ends; what lies beyond counts in the
+    /// first or the last bin.
+    pub histogram: Vec<u64>,
 }
 
 impl ValueSummary {
@@ -308,6 +330,8 @@ impl ValueSummary {
             histogram: vec![0; 256],
             nan: 0,
             infinite: 0,
+            anatomical: false,
+            core: None,
         };
         match samples {
             Samples::U8(v) => {
@@ -357,6 +381,7 @@ impl ValueSummary {
                 }
             }
         }
+        s.core = core::find(samples, &s);
         s
     }
 
@@ -380,6 +405,13 @@ impl ValueSummary {
     /// Returns the smallest and the largest finite value.
     pub fn range(&self) -> (f64, f64) {
         let (a, b) = (self.map.value(self.min_code), self.map.value(self.max_code));
+        (a.min(b), a.max(b))
+    }
+
+    /// Returns the values between which nearly all samples lie: of the core, or else the range.
+    pub fn core_range(&self) -> (f64, f64) {
+        let Some(core) = &self.core else { return self.range() };
+        let (a, b) = (self.map.value(core.min_code), self.map.value(core.max_code));
         (a.min(b), a.max(b))
     }
 
@@ -420,7 +452,7 @@ impl Volume {
         map: ValueMap,
     ) -> Self {
         assert_eq!(lattice.len(), samples.len(), "one sample for each lattice point");
-        let summary = ValueSummary::from_samples(&samples, map);
+        let summary = ValueSummary { anatomical, ..ValueSummary::from_samples(&samples, map) };
         Volume {
             name: name.into(),
             file_type: file_type.into(),

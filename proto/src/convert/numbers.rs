@@ -97,6 +97,8 @@ pub(super) fn summary_from_fields(
         histogram: fields.histogram,
         nan: fields.nan_samples,
         infinite: fields.infinite_samples,
+        anatomical: false,
+        core: None,
     };
     check_summary(&summary)?;
     Ok(summary)

@@ -109,6 +109,8 @@ pub fn info() -> impl Strategy<Value = VolumeInfo> {
             histogram,
             nan: odd,
             infinite: odd / 2,
+            anatomical: false,
+            core: None,
         });
     (any::<[u8; 32]>(), lattice, summary).prop_map(|(digest, lattice, summary)| VolumeInfo {
         digest: Digest32(digest),
@@ -168,17 +170,22 @@ pub fn quality(sums: impl Strategy<Value = Sums>) -> impl Strategy<Value = Quali
     ];
     let classify = prop_oneof![Just(Classify::After), Just(Classify::Before)];
     (0.02..100.0f64, 0.0..=0.5f64, kernel, (classify, compositing), sums, any::<bool>()).prop_map(
-        |(thickness, eps, (kernel, std, radius), (classify, compositing), sums, cull)| Quality {
-            thickness,
-            eps,
-            kernel,
-            std,
-            radius,
-            classify,
-            compositing,
-            sums,
-            cull,
-            ..Quality::default()
+        |(thickness, eps, (kernel, std, radius), (classify, compositing), sums, cull)| {
+            let all = Quality {
+                thickness,
+                eps,
+                kernel,
+                std,
+                radius,
+                classify,
+                compositing,
+                sums,
+                cull,
+                ..Quality::default()
+            };
+            // Values are not reconstructed at every quality.
+            let before = Quality { classify: Classify::Before, ..all };
+            if all.check().is_ok() { all } else { before }
         },
     )
 }

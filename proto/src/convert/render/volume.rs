@@ -2,12 +2,12 @@
 
 use super::shared::{kind_from_wire, kind_to_wire, vec3_from_wire, vec3_to_wire};
 use super::{axis_from_wire, axis_to_wire, wire};
-use crate::convert::numbers::{SummaryFields, check_lattice, summary_from_fields};
+use crate::convert::numbers::{SummaryFields, check_lattice, finite, summary_from_fields};
 use crate::convert::{MAX_REASON, WireError, digest_from_wire, required};
 use crate::model::VolumeDescription;
 use bytes::Bytes;
 use glam::DVec3;
-use slabcast_common::volume::{Lattice, VolumeInfo};
+use slabcast_common::volume::{Lattice, ValueCore, ValueSummary, VolumeInfo};
 use slabcast_scene::path::Orientation;
 
 /// Converts the volume of a master to the message that clients get.
@@ -71,6 +71,12 @@ fn info_to_wire(info: &VolumeInfo) -> wire::Volume {
         histogram: s.histogram.clone(),
         nan_samples: s.nan,
         infinite_samples: s.infinite,
+        anatomical: s.anatomical,
+        core: s.core.as_ref().map(|core| wire::ValueCore {
+            min_code: core.min_code,
+            max_code: core.max_code,
+            histogram: core.histogram.clone(),
+        }),
     }
 }
 
@@ -98,6 +104,24 @@ fn info_from_wire(info: wire::Volume) -> Result<VolumeInfo, WireError> {
         nan_samples: info.nan_samples,
         infinite_samples: info.infinite_samples,
     };
-    let summary = summary_from_fields(kind_from_wire("sample_kind", info.sample_kind)?, fields)?;
+    let kind = kind_from_wire("sample_kind", info.sample_kind)?;
+    let core = info.core.map(core_from_wire).transpose().map_err(|e| e.within("core"))?;
+    let summary =
+        ValueSummary { anatomical: info.anatomical, core, ..summary_from_fields(kind, fields)? };
     Ok(VolumeInfo { digest: digest_from_wire("digest", &info.digest)?, lattice, summary })
+}
+
+fn core_from_wire(core: wire::ValueCore) -> Result<ValueCore, WireError> {
+    let wire::ValueCore { min_code, max_code, histogram } = core;
+    let (min_code, max_code) = (finite("min_code", min_code)?, finite("max_code", max_code)?);
+    if min_code >= max_code {
+        return Err(WireError::value("max_code", "is not above min_code"));
+    }
+    if histogram.len() != 256 {
+        return Err(WireError::length("histogram", histogram.len(), 256));
+    }
+    if histogram.iter().try_fold(0u64, |sum, &n| sum.checked_add(n)).is_none() {
+        return Err(WireError::value("histogram", "counts more samples than a volume can have"));
+    }
+    Ok(ValueCore { min_code, max_code, histogram })
 }

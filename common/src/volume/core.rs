@@ -1,0 +1,135 @@
+//! The part of a volume's range where its samples are.
+//!
+//! One hot voxel of 30000 above a body of 0 to 2000, or a disk of -32768 around a CT, leaves the
+//! body a few of a histogram's 256 bins, and whoever fits colours to these sees noise. So ends of
+//! the range that hold next to nothing, and padding, are cut off, and what is left is counted anew
+//! in bins of its own, until little more can be cut. Volumes without such ends, nearly all, have no
+//! core: their range will do.
+
+use super::{Samples, ValueCore, ValueSummary};
+
+/// Share of the samples that may lie beyond either end: 170 of a scan of 256^3. Fillings of teeth
+/// are ten times as many.
+const FEW: f64 = 1e-5;
+
+/// A core is of use if it has less than this share of the range; at more, bins are fine enough.
+const NARROW: f64 = 0.5;
+
+/// Width of the empty gap above padding, in widths of what lies above the gap. Air of a CT lies one
+/// such width below its tissue at most, -32768 at least eight below.
+const GAP: usize = 2;
+
+/// Most rounds: each takes a factor of 2 to 256 off the range, f32 has 2^256.
+const ROUNDS: usize = 40;
+
+/// Room below the core for what was cut off there, in widths of the core: as a hill of its own,
+/// apart from the lowest values.
+const ROOM: f64 = 0.1;
+
+/// Finds the core of samples whose range and histogram are `s`; `None` if there is no need of one.
+pub(super) fn find(samples: &Samples, s: &ValueSummary) -> Option<ValueCore> {
+    if matches!(samples, Samples::U8(_)) {
+        return None;
+    }
+    let padded = s.map.scale > 0.0;
+    let (mut lo, mut hi) = (s.min_code, s.max_code);
+    let (mut cut_below, mut histogram) = (false, s.histogram.clone());
+    for _ in 0..ROUNDS {
+        let negative = padded && s.map.value(lo) < 0.0;
+        let (first, last) = trimmed(&histogram, negative);
+        let bin = (hi - lo) / 256.0;
+        let ends = (lo + bin * first as f64, lo + bin * (last + 1) as f64);
+        let (a, b) = (ends.0.max(s.min_code), ends.1.min(s.max_code));
+        if b - a > NARROW * (hi - lo) || b <= a {
+            break;
+        }
+        cut_below |= first > 0;
+        (lo, hi) = (a, b);
+        histogram = counted(samples, lo, hi);
+    }
+    if hi - lo > NARROW * (s.max_code - s.min_code) {
+        return None;
+    }
+    if cut_below {
+        lo = (lo - ROOM * (hi - lo)).max(s.min_code);
+        histogram = counted(samples, lo, hi);
+    }
+    (hi > lo).then_some(ValueCore { min_code: lo, max_code: hi, histogram })
+}
+
+/// Returns the first and the last bin that hold more than a few samples, the bin of padding left
+/// out.
+fn trimmed(histogram: &[u64], negative: bool) -> (usize, usize) {
+    let total: u64 = histogram.iter().sum();
+    let few = ((total as f64 * FEW) as u64).max(1);
+    let mut seen = [0; 2];
+    let mut many = |side: usize, b: usize| {
+        seen[side] += histogram[b];
+        seen[side] > few
+    };
+    let (first, last) = ((0..256).find(|&b| many(0, b)), (0..256).rev().find(|&b| many(1, b)));
+    let (Some(first), Some(last)) = (first, last) else { return (0, 255) };
+    if negative && let Some(next) = (first + 1..=last).find(|&b| histogram[b] > 0) {
+        let (gap, width) = (next - first - 1, last - next + 1);
+        if gap >= GAP * width {
+            return (next, last);
+        }
+    }
+    (first, last)
+}
+
+fn counted(samples: &Samples, lo: f64, hi: f64) -> Vec<u64> {
+    let mut histogram = vec![0; 256];
+    let scale = 256.0 / (hi - lo);
+    let mut count = |code: f64| {
+        histogram[(((code - lo) * scale).max(0.0) as usize).min(255)] += 1;
+    };
+    match samples {
+        Samples::U8(v) => v.iter().for_each(|&c| count(f64::from(c))),
+        Samples::U16(v) => v.iter().for_each(|&c| count(f64::from(c))),
+        Samples::F32(v) => {
+            v.iter().filter(|c| c.is_finite()).for_each(|&c| count(f64::from(c)));
+        }
+    }
+    histogram
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::ValueMap;
+    use super::*;
+
+    fn core(values: Vec<f32>) -> Option<ValueCore> {
+        ValueSummary::from_samples(&Samples::F32(values), ValueMap::IDENTITY).core
+    }
+
+    fn body() -> Vec<f32> {
+        (0..60_000).map(|i| (i % 2000) as f32).collect()
+    }
+
+    #[test]
+    fn usual_volumes_have_no_core() {
+        assert_eq!(core(body()), None);
+        assert_eq!(core(vec![f32::NAN; 4]), None);
+        assert_eq!(core(vec![7.0; 4]), None);
+        // Air of a CT, and what lies around its circle.
+        let ct = body().into_iter().map(|v| v - 1000.0).chain(vec![-3024.0; 9000]).collect();
+        assert_eq!(core(ct), None);
+    }
+
+    #[test]
+    fn one_hot_voxel_and_padding_lie_beyond_the_core() {
+        for far in [vec![30_000.0], vec![1e30], vec![-32768.0; 20_000], vec![-1e30, 1e30]] {
+            let found = core([body(), far.clone()].concat()).unwrap_or_else(|| panic!("{far:?}"));
+            assert!((-250.0..=1.0).contains(&found.min_code), "{far:?}: {}", found.min_code);
+            assert!((1990.0..4000.0).contains(&found.max_code), "{far:?}: {}", found.max_code);
+            let counted: u64 = found.histogram.iter().sum();
+            assert_eq!(counted, 60_000 + far.len() as u64, "what lies beyond counts at the ends");
+        }
+    }
+
+    #[test]
+    fn many_bright_samples_are_no_outliers() {
+        assert_eq!(core([body(), vec![30_000.0; 60]].concat()), None);
+    }
+}

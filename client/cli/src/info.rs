@@ -4,9 +4,9 @@ use glam::DVec3;
 use slabcast_common::brick::{BRICK_VOXELS, BrickGrid};
 use slabcast_common::quality::Compositing;
 use slabcast_common::transfer::Classifier;
-use slabcast_common::volume::{Lattice, Samples, Volume, VolumeInfo};
+use slabcast_common::volume::{Lattice, Samples, ValueSummary, Volume, VolumeInfo};
 use slabcast_scene::path::Orientation;
-use slabcast_scene::presets;
+use slabcast_scene::presets::{self, Levels};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress::bytes;
 use slabcast_session::request::AxisArgs;
@@ -148,6 +148,27 @@ fn percent(part: u64, whole: u64) -> String {
     }
 }
 
+/// Says what presets are fitted to.
+fn fitted_to(s: &ValueSummary) -> String {
+    let levels = Levels::from_summary(s);
+    let mut text = match levels.water {
+        Some(water) => format!("Hounsfield units, as of a CT (water is {})", number(water)),
+        None => format!("histogram: {}", levels.content.what()),
+    };
+    if let Some(core) = s.core.as_ref().map(|_| s.core_range()) {
+        let _ = write!(
+            text,
+            "; nearly all values are {} to {}, the rest left out",
+            number(core.0),
+            number(core.1)
+        );
+    }
+    if !s.anatomical && levels.water.is_none() {
+        text += "; not known to be a body, so auto is grey";
+    }
+    text
+}
+
 /// Bytes that a master and a worker hold beside samples and bricks, for pictures of 512x512: three
 /// frames in flight, streams, tables. Measured on mri256, chris_t1, aneurism and lidc0314 with
 /// 1 and 2 threads (VmHWM less samples and bricks): 55 to 65 MiB and 25 to 32 MiB. A master's
@@ -217,7 +238,8 @@ fn text(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
     if s.nan + s.infinite > 0 {
         row("", format!("{} NaN, {} infinite", s.nan, s.infinite));
     }
-    row("air ends at", number(lo + (hi - lo) * presets::air_threshold(s)));
+    row("air ends at", number(presets::air_end(s)));
+    row("presets by", fitted_to(s));
     let sketch = slabcast_volumes::histogram_sketch(s, 60);
     for (i, line) in sketch.lines().enumerate() {
         row(if i == 0 { "histogram" } else { "" }, line.to_string());
@@ -273,9 +295,10 @@ fn json(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
         "values": {
             "min": lo, "max": hi, "scale": s.map.scale, "offset": s.map.offset,
             "nan": s.nan, "infinite": s.infinite,
-            "air_ends": lo + (hi - lo) * presets::air_threshold(s),
+            "air_ends": presets::air_end(s),
             "histogram": s.histogram,
         },
+        "presets_by": presets_by(s),
         "bricks": { "edge": 8, "count": grid.len(), "voxels": BRICK_VOXELS },
         "presets": shares.iter().map(|p| serde_json::json!({
             "name": p.name, "for": p.what, "visible": p.voxels,
@@ -285,6 +308,20 @@ fn json(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
             "samples": sample_bytes(info),
             "bricks_auto": shares.first().map_or(0, |s| s.bytes),
         },
+    })
+}
+
+/// What presets are fitted to.
+fn presets_by(s: &ValueSummary) -> serde_json::Value {
+    let levels = Levels::from_summary(s);
+    let (from, to) = s.core_range();
+    serde_json::json!({
+        "rule": if levels.water.is_some() { "hounsfield" } else { "histogram" },
+        "water": levels.water,
+        "content": levels.content.name(),
+        "body": s.anatomical || levels.water.is_some(),
+        "range": [from, to],
+        "outliers_left_out": s.core.is_some(),
     })
 }
 
@@ -321,8 +358,12 @@ mod tests {
             let info = volume.info(volume.digest());
             let shares = shares(&volume, &info).unwrap();
             let o = Orientation::new(None, None).unwrap();
-            assert!(text(&volume, &info, o, &shares).contains("histogram"), "{name}");
-            assert_eq!(json(&volume, &info, o, &shares)["version"], 1);
+            assert!(text(&volume, &info, o, &shares).contains("presets by   histogram"), "{name}");
+            let json = json(&volume, &info, o, &shares);
+            assert_eq!(
+                (&json["version"], &json["presets_by"]["rule"]),
+                (&1.into(), &"histogram".into())
+            );
         }
     }
 }

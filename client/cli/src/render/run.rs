@@ -5,6 +5,7 @@ use super::frame_check::FrameCheck;
 use super::trace::TraceFile;
 use slabcast_common::volume::VolumeInfo;
 use slabcast_scene::path::Orientation;
+use slabcast_scene::presets;
 use slabcast_scene::request::PathRequest;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::output::provenance::RunProvenance;
@@ -77,6 +78,12 @@ impl Run {
         let as_what = (self.output.format, self.output.fps());
         let recipe = RunProvenance::new(&self.request, info, orientation, as_what)?;
         self.output.make()?;
+        if self.tell
+            && let Some(name) = self.request.transfer.preset()
+            && let Some(why) = presets::caveat(name, &info.summary)
+        {
+            self.notes.push(format!("--tf {name}: {why}"));
+        }
         self.notes.iter().for_each(|n| progress::note(n));
         Ok(recipe)
     }

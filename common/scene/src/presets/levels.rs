@@ -13,10 +13,13 @@
 //! 2. Behind the foot, the smoothed histogram has valleys. Of those with half of the foreground
 //!    above them the deepest counts (half: so that leaves are not cut off with the air because the
 //!    trunk is denser). There the content is *solid*: a surface can be drawn.
-//! 3. Without a valley the histogram falls all the way. Little foreground is *sparse*: vessels, a
-//!    wire, a shell; much of it is a *cloud*, which an opaque surface would hide.
+//! 3. Without a valley, but with a wide gap behind the foot, the content is whole, too. With neither
+//!    the histogram falls all the way. Little foreground is *sparse*: vessels, a wire, a shell; much
+//!    of it is a *cloud*, which an opaque surface would hide.
 //!
-//! All numbers are shares of the range: 0 the smallest value, 1 the largest.
+//! All numbers are shares of the range that presets are fitted to
+//! ([`ValueSummary::core_range`]): 0 its lower end, 1 its upper one. Mostly that is the whole range;
+//! it leaves out what one hot voxel or the padding around a scan would add to it.
 
 use slabcast_common::volume::{SampleKind, ValueSummary};
 use std::ops::Range;
@@ -31,6 +34,10 @@ const DEPTH: f64 = 1.5;
 
 /// Factor of the lowest bin below which a bin belongs to the valley's floor.
 const FLOOR: f64 = 1.25;
+
+/// Width of a gap, as a share of the range, behind which something whole begins: a label of a
+/// segmentation, an object in an air that was set to zero. Tails of scans have gaps of a bin or two.
+const GAP: f64 = 0.1;
 
 /// Share of the volume above which foreground without a valley is a cloud.
 const CLOUD: f64 = 0.15;
@@ -48,6 +55,30 @@ pub enum Content {
     Everywhere,
     /// One value, or none.
     Constant,
+}
+
+impl Content {
+    /// Returns the kind as one word.
+    pub fn name(self) -> &'static str {
+        match self {
+            Content::Solid => "solid",
+            Content::Sparse => "sparse",
+            Content::Cloud => "cloud",
+            Content::Everywhere => "everywhere",
+            Content::Constant => "constant",
+        }
+    }
+
+    /// Returns the kind in words for people.
+    pub fn what(self) -> &'static str {
+        match self {
+            Content::Solid => "something solid, apart from the air",
+            Content::Sparse => "a little in much air",
+            Content::Cloud => "a cloud that thins out into the air",
+            Content::Everywhere => "no air, something everywhere",
+            Content::Constant => "one value",
+        }
+    }
 }
 
 /// Levels of a histogram, as shares of the value range (0 to 1).
@@ -69,6 +100,9 @@ pub struct Levels {
     /// End of the colours, as a share of the value range (0 to 1): 0.2 % of the samples above the
     /// air exceed it.
     pub top: f64,
+    /// Whether somebody has cut out what is drawn (a brain without its skull): much of the volume
+    /// has one value, and next to nothing lies between that and the content.
+    pub masked: bool,
     /// Value of water in the file's units, where values are Hounsfield units but for an offset;
     /// else `None`.
     pub water: Option<f64>,
@@ -86,6 +120,7 @@ impl Levels {
             dense: 0.75,
             densest: 0.9,
             top: 1.0,
+            masked: false,
             water: None,
         };
         if bins.len() < 2 {
@@ -101,6 +136,7 @@ impl Levels {
             dense: above(0.75).max(solid),
             densest: above(0.9).max(solid),
             top: above(0.998).max(air + 0.02).max(solid).min(1.0),
+            masked: content == Content::Solid && masked(&bins, above(0.5)),
             water: water(summary),
         }
     }
@@ -109,14 +145,20 @@ impl Levels {
 /// Histogram in unit coordinates, ascending, without empty bins: `(centre, count)`.
 fn unit_histogram(s: &ValueSummary) -> Vec<(f64, f64)> {
     let span = s.max_code - s.min_code;
+    // Codes have a bin each if they have 8 bits; others lie somewhere in theirs.
+    let place = |b: usize| {
+        if s.core.is_none() && s.kind == SampleKind::U8 {
+            if span > 0.0 { (s.bin_code(b) - s.min_code) / span } else { 0.0 }
+        } else if span > 0.0 {
+            (b as f64 + 0.5) / 256.0
+        } else {
+            0.0
+        }
+    };
+    let counts = s.core.as_ref().map_or(&s.histogram, |core| &core.histogram);
     let mut bins: Vec<(f64, f64)> = (0..256)
-        .filter(|&b| s.histogram[b] > 0)
-        .map(|b| {
-            let centre =
-                if s.kind == SampleKind::U8 { s.bin_code(b) } else { s.bin_code(b) + span / 512.0 };
-            let t = if span > 0.0 { (centre - s.min_code) / span } else { 0.0 };
-            (if s.map.scale < 0.0 { 1.0 - t } else { t }, s.histogram[b] as f64)
-        })
+        .filter(|&b| counts[b] > 0)
+        .map(|b| (if s.map.scale < 0.0 { 1.0 - place(b) } else { place(b) }, counts[b] as f64))
         .collect();
     bins.sort_by(|a, b| a.0.total_cmp(&b.0));
     bins
@@ -178,13 +220,14 @@ fn ramp(bins: &[(f64, f64)]) -> (Content, f64, f64) {
         let step = (0.5 * (hill - valley)).min(0.12 * (top - valley)).max(0.004);
         return (Content::Solid, valley, valley + step);
     }
+    let gap = x(foot) - x(foot - 1);
+    if gap > GAP {
+        // Nothing in between: what lies behind it is whole, and not the tail of anything.
+        let content = if foreground > CLOUD * total { Content::Solid } else { Content::Sparse };
+        return (content, x(foot) - 0.75 * gap, x(foot) - 0.25 * gap);
+    }
     if foreground > CLOUD * total {
         return (Content::Cloud, x(foot), quantile(bins, x(foot), 0.5).max(x(foot) + 0.01));
-    }
-    let gap = x(foot) - x(foot - 1);
-    if gap > 0.1 {
-        // Nothing in between: what lies behind it is whole, and not the tail of anything.
-        return (Content::Sparse, x(foot) - 0.75 * gap, x(foot) - 0.25 * gap);
     }
     // A little way up the tail: what is just above the foot is noise.
     let from = x(foot) + 0.02;
@@ -249,21 +292,32 @@ fn valley(tail: &[(f64, f64)], raw: &[(f64, f64)], foreground: f64) -> Option<(f
     Some((tail[at].0, hill.0))
 }
 
+/// Whether content with its median at `mid` was cut out of what was around it. At the sharp edge of
+/// a mask 1 to 2 % of what is drawn lies in the lower third below the median; the skin, fat and
+/// bone of a whole head are 10 to 30 %.
+fn masked(bins: &[(f64, f64)], mid: f64) -> bool {
+    let total: f64 = bins.iter().map(|b| b.1).sum();
+    let (lowest, nothing) = bins[0];
+    let count = |from: f64, to: f64| -> f64 {
+        bins.iter().filter(|b| b.0 > from && b.0 < to).map(|b| b.1).sum()
+    };
+    nothing > 0.4 * total
+        && count(lowest, lowest + (mid - lowest) / 3.0) < 0.03 * count(lowest, 1.1)
+}
+
 /// The value of water, if the values are those of a CT: Hounsfield units, or these with 1000 or
 /// 1024 added, as older files store them. Told by three hills: air, soft tissue, and little
 /// between the two. 8-bit volumes have lost their scale.
 fn water(s: &ValueSummary) -> Option<f64> {
-    let (lo, hi) = s.range();
+    let (lo, hi) = s.core_range();
     if s.kind == SampleKind::U8 || hi - lo < 1200.0 || hi - lo > 20_000.0 {
         return None;
     }
-    let total: u64 = s.histogram.iter().sum();
+    let bins = unit_histogram(s);
+    let total: f64 = bins.iter().map(|b| b.1).sum();
     let share = |from: f64, to: f64| {
-        let inside = (0..256).filter(|&b| {
-            let centre = 0.5 * (s.bin_code(b) + s.bin_code(b + 1));
-            (from..=to).contains(&s.map.value(centre))
-        });
-        inside.map(|b| s.histogram[b]).sum::<u64>() as f64 / total.max(1) as f64
+        let inside = bins.iter().filter(|b| (from..=to).contains(&(lo + (hi - lo) * b.0)));
+        inside.map(|b| b.1).sum::<f64>() / total.max(1.0)
     };
     [0.0, 1000.0, 1024.0].into_iter().find(|water| {
         let between = |from: f64, to: f64| share(water + from, water + to);

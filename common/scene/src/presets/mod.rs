@@ -19,13 +19,15 @@ pub use maps::{MAPS, colour_map};
 use slabcast_common::quality::InvalidField;
 use slabcast_common::shade::Shading;
 use slabcast_common::spelling::nearest;
-use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{
+    ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction, interpolate,
+};
 use slabcast_common::volume::{SampleKind, ValueSummary};
 
 /// Names of the presets and what each is for, in the order of the help text. [`MAPS`] has the
 /// colour maps.
 pub const NAMES: [(&str, &str); 20] = [
-    ("auto", "cuts the air and draws what is there as surface or cloud"),
+    ("auto", "cuts the air and draws what is there as surface or cloud, grey unless it is a body"),
     ("skin", "the outermost surface, in a skin's colours"),
     ("bone", "what is dense: bone of a CT, the upper half above the air else"),
     ("vessels", "bright, thin structures in red"),
@@ -56,18 +58,21 @@ const WARM: [[f64; 4]; 4] = [
     [128.0, 0.97, 0.86, 0.76],
     [255.0, 1.0, 0.97, 0.92],
 ];
+/// Of what may be anything.
+const STONE: [[f64; 4]; 3] =
+    [[0.0, 0.80, 0.77, 0.72], [128.0, 0.89, 0.87, 0.83], [255.0, 1.0, 0.99, 0.96]];
 const RED: [[f64; 4]; 4] = [
-    [0.0, 0.7, 0.1, 0.1],
-    [60.0, 0.8, 0.2, 0.15],
+    [0.0, 0.78, 0.16, 0.13],
+    [60.0, 0.85, 0.25, 0.19],
     [160.0, 0.95, 0.45, 0.35],
     [255.0, 1.0, 0.9, 0.8],
 ];
 const IVORY: [[f64; 4]; 3] =
-    [[0.0, 0.78, 0.70, 0.58], [128.0, 0.93, 0.89, 0.80], [255.0, 1.0, 0.99, 0.96]];
+    [[0.0, 0.89, 0.83, 0.72], [128.0, 0.95, 0.91, 0.83], [255.0, 1.0, 0.99, 0.96]];
 const PINK: [[f64; 4]; 4] = [
-    [0.0, 0.70, 0.42, 0.40],
-    [110.0, 0.86, 0.62, 0.57],
-    [190.0, 0.95, 0.82, 0.76],
+    [0.0, 0.88, 0.66, 0.61],
+    [110.0, 0.91, 0.73, 0.68],
+    [190.0, 0.95, 0.84, 0.79],
     [255.0, 1.0, 0.95, 0.90],
 ];
 const FLESH: [[f64; 4]; 4] = [
@@ -89,8 +94,8 @@ const CASTING: [[f64; 4]; 4] = [
 const STEEL: [[f64; 4]; 2] = [[0.0, 0.62, 0.65, 0.70], [255.0, 0.92, 0.94, 0.96]];
 const LEAVES: [[f64; 4]; 4] = [
     [0.0, 0.30, 0.55, 0.16],
-    [70.0, 0.45, 0.66, 0.22],
-    [120.0, 0.58, 0.42, 0.24],
+    [35.0, 0.42, 0.62, 0.21],
+    [70.0, 0.58, 0.42, 0.24],
     [255.0, 0.86, 0.72, 0.54],
 ];
 const EMBERS: [[f64; 4]; 5] = [
@@ -115,6 +120,7 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, I
     let l = Levels::from_summary(summary);
     let at = hounsfield(summary, &l);
     let (air, solid, top) = (l.air, l.solid, l.top);
+    let body = summary.anatomical || at.is_some();
     let unlit = |tf: TransferFunction| TransferFunction {
         shading: Shading { on: false, ..Shading::default() },
         ..tf
@@ -127,13 +133,17 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, I
     let tf = match name {
         // Of a CT the skin hides the bones, and the couch the body.
         "auto" if at.is_some() => return by_name("muscle", summary),
-        "auto" => auto(&l),
+        // At the edge of a mask nothing is to be seen but the mask.
+        "auto" if body && l.masked => return by_name("brain", summary),
+        "auto" => auto(&l, if body { &WARM } else { &STONE }),
         "skin" => match &at {
             Some(hu) => surface(&WARM, [hu(-500.0), hu(400.0)], hu(-420.0), hu(-180.0)),
             None => surface(&WARM, [air, top], air, solid),
         },
         "bone" => match &at {
             Some(hu) => surface(&IVORY, [hu(100.0), hu(1400.0)], hu(140.0), hu(320.0)),
+            // Bone alone, as of a skull in air: all of it.
+            None if l.content == Content::Sparse => surface(&IVORY, [air, top], air, solid),
             None => surface(&IVORY, [air, top], dense * 0.92, dense + (top - air) * 0.1),
         },
         "vessels" => match (&at, l.content) {
@@ -141,7 +151,7 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, I
             (None, Content::Sparse) => surface(&RED, [air, top], air, solid),
             (None, _) => {
                 let cut = air + (top - air) * 0.2;
-                look(&RED, [air, top], &[[air, 0.0], [cut, 0.5], [top.max(cut), 0.95]])
+                look(&RED, [cut, top], &[[air, 0.0], [cut, 0.5], [top.max(cut), 0.95]])
             }
         },
         "brain" => match &at {
@@ -222,7 +232,7 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, I
         "plant" => surface(&LEAVES, [air, top], air, solid),
         "glass" => TransferFunction {
             gradient_opacity: vec![[0.02, 0.0], [0.12, 0.25], [0.3, 1.0]],
-            ..look(&GLASS, [air, top], &[[air, 0.0], [solid, 0.5], [top, 0.7]])
+            ..look(&GLASS, [air, top], &[[air, 0.0], [solid, 0.08], [top, 0.2]])
         },
         "fog" => fog(&MIST, 0.03),
         "fire" => {
@@ -249,7 +259,59 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, I
             tf
         }
     };
-    Ok(tf)
+    Ok(if name.starts_with("peer-") { tf } else { over_whole_range(tf, summary) })
+}
+
+/// Returns a function over the range that presets are fitted to as one over the whole volume.
+fn over_whole_range(tf: TransferFunction, summary: &ValueSummary) -> TransferFunction {
+    if summary.core.is_none() {
+        return tf;
+    }
+    let ((lo, hi), (from, to)) = (summary.range(), summary.core_range());
+    // In the file's values: shares of a range that ends at 1e30 would have no digits left. But
+    // gradients are per mm then, which a preset does not know.
+    let shares = !tf.gradient_opacity.is_empty();
+    let place = |t: f64| {
+        let value = from + (to - from) * t;
+        if shares { ((value - lo) / (hi - lo)).clamp(0.0, 1.0) } else { value }
+    };
+    TransferFunction {
+        domain: if shares { Domain::Unit } else { Domain::Value },
+        colors: tf.colors.iter().map(|c| [place(c[0]), c[1], c[2], c[3]]).collect(),
+        opacities: tf.opacities.iter().map(|o| [place(o[0]), o[1]]).collect(),
+        gradient_opacity: tf
+            .gradient_opacity
+            .iter()
+            .map(|g| [g[0] * (to - from) / (hi - lo), g[1]])
+            .collect(),
+        ..tf
+    }
+}
+
+/// Returns the reason why the preset `name` may not show what its name says in a volume with values
+/// `summary`; `None` if it does, as far as the values tell.
+pub fn caveat(name: &str, summary: &ValueSummary) -> Option<&'static str> {
+    let l = Levels::from_summary(summary);
+    let whole = matches!(l.content, Content::Solid | Content::Cloud | Content::Everywhere);
+    match (name, hounsfield(summary, &l)) {
+        ("bone", None) if whole => Some(
+            "the values are not those of a CT, so the upper half of them is taken for bone; of an \
+             MRI that is fat and white matter, and bone can't be told from air",
+        ),
+        ("lung", None) => Some(
+            "the values are not those of a CT, so a shell at the end of the air is drawn; it is a \
+             lung only if the volume shows one",
+        ),
+        ("brain", Some(_)) => Some("in a CT skull and skin hide the brain; --crop cuts into them"),
+        ("brain", None) if whole && !l.masked => Some(
+            "skin and skull are still there and hide the brain; strip them first, or cut into them \
+             by --crop",
+        ),
+        ("metal", Some(hu)) if hu(1800.0) >= 1.0 => Some(
+            "nothing in this CT is as dense as metal (1800 HU); the densest of it is drawn instead",
+        ),
+        _ => None,
+    }
 }
 
 /// Returns the error for a name that is neither a preset nor a map, with the nearest one.
@@ -269,20 +331,20 @@ pub fn unknown_name(name: &str) -> InvalidField {
 
 /// Returns a preset for whatever there is: a surface where there is one, else a cloud that can be
 /// seen through.
-fn auto(l: &Levels) -> TransferFunction {
+fn auto(l: &Levels, colours: &Colours) -> TransferFunction {
     let (air, solid, top) = (l.air, l.solid, l.top);
     match l.content {
-        Content::Solid | Content::Sparse => surface(&WARM, [air * 0.5, top], air, solid),
+        Content::Solid | Content::Sparse => surface(colours, [air, top], air, solid),
         Content::Cloud => look(
             &EMBERS,
             [air, top],
             &[[air, 0.0], [l.mid, 0.02], [l.dense.max(l.mid), 0.08], [top, 0.4]],
         ),
         // Nothing is air, so everything is shown, the lowest hardly.
-        Content::Everywhere => look(&WARM, [0.0, 1.0], &[[0.0, 0.0], [1.0, 0.08]]),
+        Content::Everywhere => look(colours, [0.0, 1.0], &[[0.0, 0.0], [1.0, 0.08]]),
         // By `Classifier`, the one value is 0 of the range: nothing to see, and the caller says
         // so. An opaque block would be no better.
-        Content::Constant => surface(&WARM, [0.0, 1.0], 0.25, 0.75),
+        Content::Constant => surface(colours, [0.0, 1.0], 0.25, 0.75),
     }
 }
 
@@ -290,13 +352,15 @@ fn auto(l: &Levels) -> TransferFunction {
 /// CT.
 fn hounsfield(summary: &ValueSummary, l: &Levels) -> Option<impl Fn(f64) -> f64> {
     let water = l.water?;
-    let (lo, hi) = summary.range();
+    let (lo, hi) = summary.core_range();
     Some(move |hu: f64| ((hu + water - lo) / (hi - lo)).clamp(0.0, 1.0))
 }
 
-/// Returns a lit surface: opaque within a short ramp.
+/// Returns a lit surface: opaque within a short ramp. Up to the ramp's end it has one colour:
+/// voxels at the surface are partly full, and colours over the ramp would say how much, which draws
+/// rings on everything round.
 fn surface(colours: &Colours, range: [f64; 2], from: f64, to: f64) -> TransferFunction {
-    look(colours, range, &[[from, 0.0], [to, 1.0]])
+    look(colours, [range[0].max(to), range[1]], &[[from, 0.0], [to, 1.0]])
 }
 
 /// Returns a translucent outside of at most `alpha` over an opaque inside.
@@ -308,8 +372,21 @@ fn layers(
     inside: [f64; 2],
 ) -> TransferFunction {
     let [a, b] = outside;
-    let [c, d] = inside;
-    look(colours, range, &[[a, 0.0], [b, alpha], [c.max(b), alpha], [d.max(c), 0.9]])
+    let (c, d) = (inside[0].max(b), inside[1].max(inside[0]).max(b));
+    let mut tf = look(colours, range, &[[a, 0.0], [b, alpha], [c, alpha], [d, 0.9]]);
+    // One colour over each ramp, as for a surface: at the outer one its first, at the inner one its
+    // last, by a step. What lies between the two keeps its own.
+    let at = |x: f64, place: f64| {
+        let [_, r, g, b] = interpolate(&tf.colors, place);
+        [x, r, g, b]
+    };
+    let between =
+        |lo: f64, hi: f64| tf.colors.iter().copied().filter(move |p| p[0] > lo && p[0] < hi);
+    let outer = [at(a, a), at(b, a)];
+    let inner = [at(c, c), at(c, d), at(d, d)];
+    tf.colors =
+        outer.into_iter().chain(between(b, c)).chain(inner).chain(between(d, 2.0)).collect();
+    tf
 }
 
 /// Returns a lit function of colours over a range and opacities, both over `[0, 1]` from the
@@ -357,9 +434,10 @@ fn peer(summary: &ValueSummary, colors: &Colours, opacities: &[[f64; 2]]) -> Tra
     tf
 }
 
-/// Returns where the air ends, as a share of the value range (0 to 1).
-pub fn air_threshold(summary: &ValueSummary) -> f64 {
-    Levels::from_summary(summary).air
+/// Returns the value at which the air ends.
+pub fn air_end(summary: &ValueSummary) -> f64 {
+    let (lo, hi) = summary.core_range();
+    lo + (hi - lo) * Levels::from_summary(summary).air
 }
 
 #[cfg(test)]
@@ -402,6 +480,80 @@ mod tests {
         assert_eq!((opacity(55.0), opacity(175.0)), (0.0, 1.0));
     }
 
+    /// Air, a gap, something solid: a body if `anatomical` says so.
+    fn solid(anatomical: bool, more: &[f32]) -> ValueSummary {
+        let air = std::iter::repeat_n(0.0f32, 70_000);
+        let rest = (0..30_000).map(|i| 400.0 + (i % 500) as f32);
+        let all = air.chain(rest).chain(more.iter().copied()).collect();
+        let s = ValueSummary::from_samples(&Samples::F32(all), ValueMap::IDENTITY);
+        ValueSummary { anatomical, ..s }
+    }
+
+    #[test]
+    fn surfaces_have_one_colour_over_the_ramp_of_their_opacity() {
+        let s = solid(true, &[]);
+        for name in
+            ["auto", "skin", "bone", "brain", "vessels", "muscle", "teeth", "plant", "metal"]
+        {
+            let tf = by_name(name, &s).unwrap();
+            let steep = tf.opacities.windows(2).filter(|w| w[1][1] - w[0][1] > 0.5);
+            for w in steep {
+                let end = w[1][0];
+                let colour = |x: f64| interpolate(&tf.colors, x);
+                // Where there are bits of it: at a step the later colour holds.
+                for x in [0.001, 0.5, 0.999].map(|t| w[0][0] + (end - w[0][0]) * t) {
+                    let (here, there) = (colour(x), colour(end));
+                    let off = (1..4).map(|c| (here[c] - there[c]).abs());
+                    assert!(off.fold(0.0, f64::max) < 1e-9, "{name} at {x} of {:?}", tf.opacities);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn auto_is_grey_unless_it_draws_a_body() {
+        let warmth = |anatomical| {
+            let tf = by_name("auto", &solid(anatomical, &[])).unwrap();
+            tf.colors[0][1] - tf.colors[0][3]
+        };
+        assert!(warmth(true) > 0.2 && warmth(false) < 0.1);
+    }
+
+    #[test]
+    fn hot_voxels_and_padding_do_not_move_a_preset() {
+        let plain = solid(false, &[]);
+        let (lo, hi) = plain.range();
+        for far in [vec![1e6], vec![-32768.0; 5000]] {
+            let s = solid(false, &far);
+            for name in ["auto", "bone", "fog", "viridis"] {
+                let (a, b) = (by_name(name, &plain).unwrap(), by_name(name, &s).unwrap());
+                b.check().unwrap();
+                assert_eq!(b.domain, Domain::Value);
+                let rise =
+                    |tf: &TransferFunction| tf.opacities.iter().find(|o| o[1] > 0.0).unwrap()[0];
+                let (a, b) = (lo + (hi - lo) * rise(&a), rise(&b));
+                assert!((a - b).abs() < 0.2 * (hi - lo), "{name} beside {}: {a} {b}", far[0]);
+            }
+            assert!((10.0..400.0).contains(&air_end(&s)), "{}", air_end(&s));
+        }
+    }
+
+    #[test]
+    fn a_preset_says_when_the_volume_has_not_what_it_shows() {
+        let mri = solid(true, &[]);
+        assert!(caveat("bone", &mri).unwrap().contains("MRI"));
+        assert!(caveat("lung", &mri).unwrap().contains("CT"));
+        assert_eq!(caveat("skin", &mri), None);
+        // Bone alone in air, and a brain that was taken out of its head.
+        let sparse: Vec<u8> =
+            (0..90_000u32).map(|i| if i % 50 == 0 { (i % 200) as u8 } else { 0 }).collect();
+        let sparse = ValueSummary::from_samples(&Samples::U8(sparse), ValueMap::IDENTITY);
+        assert_eq!(caveat("bone", &sparse), None);
+        assert_eq!(caveat("brain", &mri), None, "nothing lies between it and the air");
+        let skin = solid(true, &(0..9000).map(|i| 60.0 + (i % 100) as f32).collect::<Vec<_>>());
+        assert!(caveat("brain", &skin).unwrap().contains("skull"));
+    }
+
     #[test]
     fn unknown_preset_names_get_the_nearest_and_all_names() {
         let s = ValueSummary::from_samples(&Samples::U8(vec![0, 255]), ValueMap::IDENTITY);
@@ -412,7 +564,7 @@ mod tests {
     }
 
     #[test]
-    fn air_threshold_finds_a_thin_object_in_much_air() {
+    fn air_ends_before_a_thin_object_in_much_air() {
         // Less than 1 % bright voxels, as in an angiogram.
         let mut v = vec![0u8; 100_000];
         for i in 0..20_000 {
@@ -422,7 +574,7 @@ mod tests {
             v[i] = 90 + (i % 160) as u8;
         }
         let s = ValueSummary::from_samples(&Samples::U8(v), ValueMap::IDENTITY);
-        let cut = air_threshold(&s) * 249.0;
+        let cut = air_end(&s);
         assert!((11.0..100.0).contains(&cut), "cut at {cut}");
     }
 }

@@ -38,6 +38,7 @@ pub use slabcast_proto::status::Reason;
 use prost::Message;
 use slabcast_proto::render_v1::{self as wire, render_service_client::RenderServiceClient};
 use slabcast_proto::{MAX_RENDER_MESSAGE, convert};
+use slabcast_scene::path::Framing;
 use slabcast_scene::request::PathRequest;
 use std::future::Future;
 use std::sync::Arc;
@@ -67,6 +68,16 @@ const LONGEST_AGAIN: Duration = Duration::from_secs(2);
 pub struct Client {
     render: RenderServiceClient<Channel>,
     address: Arc<str>,
+}
+
+/// Answer of a master to a path.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Submitted {
+    /// Name of the job.
+    pub job: String,
+    /// Target and height that the path was given, if it asked for them. A master older than this
+    /// program knows of no such wish: it frames the volume's box.
+    pub framing: Option<Framing>,
 }
 
 impl Client {
@@ -117,6 +128,15 @@ impl Client {
     /// is, [`ClientError::Full`] if the master takes no more jobs; [`ClientError::Status`] with
     /// [`Reason::ClientKeyTaken`] if the key belongs to another request.
     pub async fn submit(&self, request: &PathRequest) -> Result<String, ClientError> {
+        Ok(self.submit_framed(request).await?.job)
+    }
+
+    /// Submits a path as [`Client::submit`], and returns the framing that it was given beside the
+    /// job's name.
+    ///
+    /// # Errors
+    /// As [`Client::submit`].
+    pub async fn submit_framed(&self, request: &PathRequest) -> Result<Submitted, ClientError> {
         request.path.check().map_err(|e| ClientError::InvalidField {
             field: convert::wire_field(&e.field, &request.path),
             problem: e.problem,
@@ -132,7 +152,9 @@ impl Client {
         if reply.job_id.is_empty() {
             return Err(self.protocol_error("job_id is empty"));
         }
-        Ok(reply.job_id)
+        let framing = reply.framing.map(convert::framing_from_wire).transpose();
+        let framing = framing.map_err(|e| self.protocol_error(&e))?;
+        Ok(Submitted { job: reply.job_id, framing })
     }
 
     /// Streams the frames of a job from `from_frame` on, over one connection: when that breaks, so

@@ -49,7 +49,10 @@ impl RenderService for Script {
             keys.push(request.client_key);
             keys.len() - 1
         });
-        Ok(Response::new(wire::SubmitPathResponse { job_id: format!("job-{number}") }))
+        Ok(Response::new(wire::SubmitPathResponse {
+            job_id: format!("job-{number}"),
+            framing: None,
+        }))
     }
 
     async fn watch_frames(

@@ -107,6 +107,7 @@ impl Master {
             inbox: inbox.clone(),
             jobs: jobs.clone(),
             served: served.clone(),
+            volume: config.volume.clone(),
             planning: Arc::new(Semaphore::new(PLANS_AT_ONCE)),
             hooks: config.hooks.clone(),
         };
@@ -152,6 +153,7 @@ pub struct Handle {
     inbox: mpsc::Sender<Event>,
     jobs: Arc<Jobs>,
     served: Arc<ServedVolume>,
+    volume: Arc<Volume>,
     planning: Arc<Semaphore>,
     hooks: Hooks,
 }
@@ -180,11 +182,12 @@ impl Handle {
         }
         let place = self.planning.clone().acquire_owned().await.map_err(|_| SubmitError::Gone)?;
         let (served, hooks) = (self.served.clone(), self.hooks.clone());
+        let volume = self.volume.clone();
         let planned = tokio::task::spawn_blocking(move || {
             let _place = place;
             caught("checking the request", || {
                 hooks.reach(Stage::Plan);
-                Plan::new(request, &served)
+                Plan::new(request, &served, &volume)
             })
         });
         let plan = planned.await.map_err(|_| SubmitError::Gone)?;

@@ -9,8 +9,8 @@ use slabcast_proto::cluster_v1::cluster_service_client::ClusterServiceClient;
 use slabcast_proto::convert;
 use slabcast_proto::render_v1::render_service_client::RenderServiceClient;
 use slabcast_proto::render_v1::{
-    GetJobRequest, JobState, ListJobsRequest, ListWorkersRequest, SubmitPathRequest, Turntable,
-    ViewPath, WatchFramesRequest, view_path::Cameras,
+    Fit, GetJobRequest, JobState, ListJobsRequest, ListWorkersRequest, SubmitPathRequest,
+    Turntable, ViewPath, WatchFramesRequest, view_path::Cameras,
 };
 use slabcast_proto::status::{Details, Reason};
 use slabcast_scene::path::Orientation;
@@ -96,6 +96,28 @@ async fn error_details_name_reason_field_and_metadata() {
     let status = render.watch_frames(ask).await.unwrap_err();
     let details = assert_status(&status, Code::OutOfRange, Reason::FrameBeyondEnd);
     assert_eq!(details.number("frames_total"), Some(3));
+}
+
+/// The numbers that a master found make the same picture when they are given.
+#[tokio::test]
+async fn framing_is_told_once_it_is_asked_for() {
+    let served = served().await;
+    let mut render = RenderServiceClient::new(served.channel.clone());
+    let mut ask = request("a", Turntable { frames: Some(1), ..Turntable::default() });
+    let plain = render.submit_path(ask.clone()).await.unwrap().into_inner();
+    assert_eq!(plain.framing, None);
+    ask.client_key = "b".into();
+    ask.path.as_mut().unwrap().fit = Fit::Visible.into();
+    let told = render.submit_path(ask.clone()).await.unwrap().into_inner();
+    let framing = told.framing.expect("it was asked for");
+    assert!((1.0..40.0).contains(&framing.height) && framing.target.is_some(), "{framing:?}");
+    // The same key is the same request, with the same answer.
+    let again = render.submit_path(ask.clone()).await.unwrap().into_inner();
+    assert_eq!((again.job_id, again.framing), (told.job_id, Some(framing)));
+    ask.client_key = "c".into();
+    let Some(Cameras::Turntable(t)) = &mut ask.path.as_mut().unwrap().cameras else { panic!() };
+    (t.target, t.height) = (framing.target, Some(framing.height));
+    assert_eq!(render.submit_path(ask).await.unwrap().into_inner().framing, None);
 }
 
 #[tokio::test]

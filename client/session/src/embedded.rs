@@ -172,6 +172,7 @@ pub async fn submit(
     let Some(mut watch) = handle.watch(job, 0) else {
         return Err(Fail::failed(format!("{job} was forgotten by the master of this process")));
     };
+    let framing = handle.job(job).and_then(|job| job.framing);
     let (to, updates) = mpsc::channel(1);
     let total = request.path.frames() as u64;
     tokio::spawn(async move {
@@ -220,5 +221,5 @@ pub async fn submit(
     let cancel = Cancel::new(async move {
         handle.cancel(job).await;
     });
-    Ok(Source { updates, cancel })
+    Ok(Source { updates, cancel, framing })
 }

@@ -13,9 +13,9 @@ use slabcast_common::view::View;
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_render::{Frame, Scene};
 use slabcast_scene::brick_needs::BrickNeeds;
-use slabcast_scene::path::Orientation;
+use slabcast_scene::path::{Framing, Orientation};
 use slabcast_scene::tween::Tween;
-use slabcast_volumes::BrickStore;
+use slabcast_volumes::{BrickStore, framing};
 use std::sync::Arc;
 
 /// A scene's specification and all its bricks.
@@ -81,6 +81,8 @@ pub struct PathScenes {
     shared: Arc<Scene>,
     /// Bricks that serve all frames of the path.
     pub bricks: Bricks,
+    /// Target and height that the path was given, if it asked for them.
+    pub framing: Option<Framing>,
 }
 
 impl PathScenes {
@@ -97,6 +99,8 @@ impl PathScenes {
         let blame = |e| request.blame(&e);
         let transfer = request.transfer.function(info).map_err(blame)?;
         let tween = Tween::from_path(&request.path, &info.summary).map_err(blame)?;
+        let framing =
+            framing::framing(&request.path, volume, info, &transfer, orientation).map_err(blame)?;
         let wanted =
             BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, &request.quality)
                 .map_err(blame)?
@@ -104,7 +108,11 @@ impl PathScenes {
         let SceneBricks { spec: base, bricks } =
             SceneBricks::with_requirements(volume, info, &transfer, request.quality, &wanted)?;
         let shared = Arc::new(Scene::new(&base));
-        Ok(PathScenes { request: request.clone(), orientation, base, tween, shared, bricks })
+        let mut request = request.clone();
+        if let Some(framing) = &framing {
+            request.path = request.path.framed(framing);
+        }
+        Ok(PathScenes { request, orientation, base, tween, shared, bricks, framing })
     }
 
     /// Returns the scene of the `i`-th wanted frame, with the number type of its sums decided.

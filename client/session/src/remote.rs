@@ -5,7 +5,9 @@ use crate::output::Frame;
 use crate::progress::Step;
 use crate::request::RenderRequest;
 use crate::source::{Cancel, Source, Update};
-use slabcast_client::{Client, ClientError, JobState, PATIENCE, VolumeDescription, local_field};
+use slabcast_client::{
+    Client, ClientError, JobState, PATIENCE, Submitted, VolumeDescription, local_field,
+};
 use slabcast_common::quality::InvalidField;
 use slabcast_scene::request::PathRequest;
 use std::time::{Duration, Instant};
@@ -63,12 +65,13 @@ pub async fn submit(
     request: &RenderRequest,
     message: PathRequest,
 ) -> Result<Source, Fail> {
-    let job = client.submit(&message).await.map_err(|e| match &e {
+    let submitted = client.submit_framed(&message).await.map_err(|e| match &e {
         ClientError::InvalidField { field, problem } => {
             request.blame(&InvalidField::new(local_field(field), problem))
         }
         _ => client_failure(&e),
     })?;
+    let Submitted { job, framing } = submitted;
     let (name, job_now) = watch::channel(job);
     let (to, updates) = mpsc::channel(1);
     let cancel = Cancel::new(cancel(client.clone(), job_now));
@@ -77,7 +80,7 @@ pub async fn submit(
             let _ = to.send(Err(e)).await;
         }
     });
-    Ok(Source { updates, cancel })
+    Ok(Source { updates, cancel, framing })
 }
 
 /// Passes a job's updates on until its last frame.

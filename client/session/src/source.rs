@@ -4,6 +4,7 @@ use crate::fail::Fail;
 use crate::output::Frame;
 use crate::progress::Step;
 use slabcast_common::stats::FrameStats;
+use slabcast_scene::path::Framing;
 use std::future::Future;
 use std::pin::Pin;
 use std::time::Duration;
@@ -38,6 +39,8 @@ pub struct Source {
     pub updates: mpsc::Receiver<Result<Update, Fail>>,
     /// Way to cancel the job at the master.
     pub cancel: Cancel,
+    /// Target and height that the master gave the path, if it asked for them.
+    pub framing: Option<Framing>,
 }
 
 /// Cancels one job, whoever renders it.

@@ -19,6 +19,7 @@ use bytes::Bytes;
 use slabcast_common::ids::JobId;
 use slabcast_common::image::PixelFormat;
 use slabcast_common::stats::FrameStats;
+use slabcast_scene::path::Framing;
 use slabcast_scene::request::PathRequest;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -76,6 +77,8 @@ pub struct JobView {
     pub size: [u32; 2],
     /// Format of the pixels that the job delivers.
     pub format: PixelFormat,
+    /// Target and height that the path was given, if it asked for them.
+    pub framing: Option<Framing>,
     /// Time of submission, in milliseconds since 1970 UTC.
     pub submitted_unix_ms: i64,
     /// Time at which the job ended, in milliseconds since 1970 UTC; 0 before.

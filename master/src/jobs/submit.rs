@@ -14,13 +14,15 @@ use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{InvalidField, Quality};
 use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
-use slabcast_common::volume::VolumeInfo;
+use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::path::Framing;
 use slabcast_scene::presets;
 use slabcast_scene::request::PathRequest;
 use slabcast_scene::transfer::TransferChoice;
 use slabcast_scene::tween::Tween;
 use slabcast_volumes::BrickStore;
+use slabcast_volumes::framing::framing;
 use std::sync::Arc;
 
 /// Bytes of the longest `client_key`.
@@ -54,6 +56,7 @@ pub(crate) struct Plan {
     quality: Quality,
     tween: Option<Tween>,
     views: Vec<View>,
+    framing: Option<Framing>,
 }
 
 /// Checks a client's key.
@@ -70,7 +73,11 @@ impl Plan {
     ///
     /// # Errors
     /// The field that can't be used.
-    pub(crate) fn new(request: PathRequest, served: &ServedVolume) -> Result<Plan, InvalidField> {
+    pub(crate) fn new(
+        request: PathRequest,
+        served: &ServedVolume,
+        volume: &Volume,
+    ) -> Result<Plan, InvalidField> {
         let info = &served.info;
         request.quality.check()?;
         request.work.check()?;
@@ -83,7 +90,11 @@ impl Plan {
                 (**tf).clone()
             }
         };
-        let cameras = request.path.prepare(&info.lattice, served.orientation)?;
+        let framing = framing(&request.path, volume, info, &transfer, served.orientation)?;
+        // The request stays as it came: the same key has to mean the same request.
+        let path =
+            framing.as_ref().map_or_else(|| request.path.clone(), |f| request.path.framed(f));
+        let cameras = path.prepare(&info.lattice, served.orientation)?;
         let views = (0..request.path.frames())
             .map(|i| {
                 View::new(&info.lattice, &cameras.camera(i)?, request.path.size, &request.quality)
@@ -100,7 +111,8 @@ impl Plan {
         let wanted =
             BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, &quality)?
                 .with_kept(request.work.keep);
-        Ok(Plan { request: Arc::new(request), wanted, transfer, quality, tween, views })
+        let request = Arc::new(request);
+        Ok(Plan { request, wanted, transfer, quality, tween, views, framing })
     }
 
     /// The job as the table shows it.
@@ -118,6 +130,7 @@ impl Plan {
                 workers: 0,
                 size: request.path.size,
                 format: request.format,
+                framing: self.framing,
                 submitted_unix_ms: unix_ms(),
                 finished_unix_ms: 0,
             },
@@ -134,7 +147,7 @@ impl Plan {
         bricks: BrickSetKey,
         store: Option<Arc<BrickStore>>,
     ) -> ActiveJob {
-        let Plan { request, wanted, transfer, quality, tween, views } = self;
+        let Plan { request, wanted, transfer, quality, tween, views, framing: _ } = self;
         let scene = SceneSpec { id: SceneId(id.0), volume, transfer, quality, bricks };
         ActiveJob { request, scene: Arc::new(scene), tween, wanted, views, store, next: 0 }
     }

@@ -73,6 +73,7 @@ fn job(id: JobId, frames: u64) -> Job {
         workers: 1,
         size: [1, 1],
         format: PixelFormat::Rgb8,
+        framing: None,
         submitted_unix_ms: 0,
         finished_unix_ms: 0,
     };

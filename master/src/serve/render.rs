@@ -137,7 +137,13 @@ impl RenderService for Render {
         let request = convert::submit_from_wire(request.into_inner())?;
         let path = request.path.clone();
         match self.handle.submit(request).await {
-            Ok(id) => Ok(Response::new(wire::SubmitPathResponse { job_id: id.to_string() })),
+            Ok(id) => {
+                let framing = self.handle.job(id).and_then(|job| job.framing);
+                Ok(Response::new(wire::SubmitPathResponse {
+                    job_id: id.to_string(),
+                    framing: framing.as_ref().map(convert::framing_to_wire),
+                }))
+            }
             Err(SubmitError::Refused(wrong)) => {
                 Err(invalid_field(&convert::wire_field(&wrong.field, &path), &wrong.problem))
             }

@@ -45,6 +45,7 @@ pub mod dicom;
 mod error;
 mod folder;
 pub mod formula;
+pub mod framing;
 #[cfg(test)]
 mod fuzz;
 mod metaimage;

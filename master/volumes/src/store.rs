@@ -154,7 +154,7 @@ fn encode(brick: &Brick) -> Bytes {
 
 /// Returns for each of `codes` codes whether it is relevant. Filled by interval: a test of each
 /// code would take codes times intervals, 2^31 steps for a 16-bit comb.
-fn relevance_table(support: &Support, codes: usize) -> Vec<bool> {
+pub(crate) fn relevance_table(support: &Support, codes: usize) -> Vec<bool> {
     let mut relevant = vec![false; codes];
     for &(a, b) in &support.intervals {
         let (first, last) = (a.ceil().max(0.0), b.floor().min(codes as f64 - 1.0));

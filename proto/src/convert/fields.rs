@@ -66,7 +66,7 @@ pub fn wire_field(field: &str, path: &ViewPath) -> String {
     match head {
         "views" => format!("path.views.{field}"),
         "keyframes" => format!("path.{}", key_field(field)),
-        "flythrough" | "crop" => format!("path.{field}"),
+        "flythrough" | "crop" | "fit" => format!("path.{field}"),
         "start" | "step" | "frames" | "elevation" | "height" | "fov" | "up" | "front"
         | "azimuth" | "projection" | "eye" | "target" => format!("path.{kind}.{field}"),
         "tiles-per-worker" | "tiles_per_worker" | "tiles-per-thread" | "tiles_per_thread" => {
@@ -148,6 +148,8 @@ mod tests {
             ),
             ("flythrough.eyes[1]", "path.flythrough.eyes[1]"),
             ("crop.x", "path.crop.x"),
+            ("fit", "path.fit"),
+            ("target", "path.turntable.target"),
             ("range", "path.range"),
             ("colors[2]", "transfer.function.colors[2]"),
             ("shading.power", "transfer.function.shading.power"),

@@ -31,9 +31,10 @@ pub use cluster::{
 pub use error::WireError;
 pub use fields::{local_field, wire_field};
 pub use render::{
-    Page, StatisticsPart, StatisticsParts, frame_to_wire, job_from_wire, job_to_wire,
-    notice_to_wire, page_from_wire, page_token, submit_from_wire, submit_to_wire, volume_from_wire,
-    volume_to_wire, watch_from_wire, worker_from_wire, worker_to_wire,
+    Page, StatisticsPart, StatisticsParts, frame_to_wire, framing_from_wire, framing_to_wire,
+    job_from_wire, job_to_wire, notice_to_wire, page_from_wire, page_token, submit_from_wire,
+    submit_to_wire, volume_from_wire, volume_to_wire, watch_from_wire, worker_from_wire,
+    worker_to_wire,
 };
 
 use slabcast_common::volume::Digest32;

@@ -7,9 +7,10 @@ use slabcast_common::ids::WorkerId;
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::quality::{Borders, Keep, Schedule, Sums, Work};
 use slabcast_common::stats::*;
+use slabcast_common::volume::{ValueCore, ValueSummary, VolumeInfo};
 use slabcast_proto::model;
 use slabcast_scene::path::{
-    Axis, Crop, CropUnit, Easing, FlyThrough, Key, KeyFrames, Orientation, PathView,
+    Axis, Crop, CropUnit, Easing, Fit, FlyThrough, Key, KeyFrames, Orientation, PathView,
     ProjectionKind, Side, Turntable, ViewPath,
 };
 use slabcast_scene::request::PathRequest;
@@ -110,12 +111,23 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
     );
     let turntable = (
         (number(), number(), 1u32..=100_000, number()),
-        (prop::option::of(number()), projection(), number()),
+        (prop::option::of(triple()), prop::option::of(number()), projection(), number()),
         (prop::option::of(axis()), prop::option::of(axis())),
     )
         .prop_map(
-            |((start, step, frames, elevation), (height, projection, fov), (up, front))| {
-                Turntable { start, step, frames, elevation, height, projection, fov, up, front }
+            |((start, step, frames, elevation), (target, height, projection, fov), (up, front))| {
+                Turntable {
+                    start,
+                    step,
+                    frames,
+                    elevation,
+                    target,
+                    height,
+                    projection,
+                    fov,
+                    up,
+                    front,
+                }
             },
         );
     let path = (
@@ -132,11 +144,14 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
         ],
         prop::option::of(crop()),
         any::<bool>(),
+        any::<bool>(),
     )
-        .prop_map(|(size, path, crop, range)| {
+        .prop_map(|(size, path, crop, range, visible)| {
+            let fitted = path.turntable.is_some() || path.keyframes.is_some();
+            let fit = if visible && fitted { Fit::Visible } else { Fit::Volume };
             let last = path.frames() as u32 - 1;
             let range = range.then_some([last / 3, last]);
-            ViewPath { size, crop, range, ..path }
+            ViewPath { size, crop, range, fit, ..path }
         });
     let transfer = prop_oneof![
         "[a-z-]{1,20}".prop_map(TransferChoice::Name),
@@ -237,6 +252,13 @@ pub fn volume() -> impl Strategy<Value = model::VolumeDescription> {
     (info(), axis(), 1usize..3, any::<(bool, u32, u32)>()).prop_map(
         |(info, up, turn, (a, p, q))| {
             let front = Axis { index: (up.index + turn) % 3, negative: a };
+            let core = (p % 2 == 0).then(|| ValueCore {
+                min_code: f64::from(q),
+                max_code: f64::from(q) + 1.5,
+                histogram: vec![u64::from(p); 256],
+            });
+            let summary = ValueSummary { anatomical: a, core, ..info.summary };
+            let info = VolumeInfo { summary, ..info };
             model::VolumeDescription {
                 name: "head.nii.gz".into(),
                 file_type: "int16".into(),

@@ -345,6 +345,7 @@ async fn drawn(
     let recipe = run.ready(&info, orientation, volume.anatomical)?;
     let threads = (crew.workers * crew.threads) as usize;
     let stage = PathScenes::new(&volume, &info, &run.request, orientation)?;
+    let framing = stage.framing;
     let what = format!("{}, showing {}", volume.name, show.stem());
     drop(volume);
     let (to, updates) = mpsc::channel(1);
@@ -363,7 +364,7 @@ async fn drawn(
         }
         let _ = to.blocking_send(Ok(Update::Done));
     });
-    run.go(Source { updates, cancel: Cancel::none() }, &what, &info, &recipe).await
+    run.go(Source { updates, cancel: Cancel::none(), framing }, &what, &info, &recipe).await
 }
 
 async fn cluster(

@@ -108,6 +108,7 @@ impl Run {
             tell,
             ..
         } = self;
+        let recipe = &recipe.clone().framed(source.framing.as_ref());
         let total = request.path.frames() as u64;
         let [w, h] = request.size();
         let s = if total == 1 { "" } else { "s" };

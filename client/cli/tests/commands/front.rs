@@ -195,6 +195,8 @@ fn statistics_contain_error_estimates_by_source() {
         let scene = [volume, "--tf", tf, "--thickness", thickness, "--size", "256x256"];
         // The bound of 16-bit sums, which `auto` takes for fog, says nothing.
         let scene = [&scene[..], &["--sums", "i32"]].concat();
+        // A frame of a turn and the same azimuth alone have another framing each.
+        let scene = [&scene[..], &["--fit", "volume"]].concat();
         let draw = |out: &str, more: &[&str]| {
             let how = ["--start", "33", "--step", "77", "--frames", "2", "-o", out];
             let done = run(dir, &[&["render"], &scene, &how, more]);

@@ -11,6 +11,7 @@ mod convergence;
 mod error;
 mod explain;
 mod formats;
+mod framing;
 mod front;
 mod help;
 mod manners;

@@ -3,7 +3,7 @@
 #[path = "../../../../tests/support/processes.rs"]
 mod processes;
 
-pub(crate) use processes::{Process, master, signal, slabcast};
+pub(crate) use processes::{Process, master, signal, slabcast, worker};
 
 use std::path::Path;
 use std::process::{Child, Output};

@@ -17,7 +17,7 @@ use slabcast_common::stats::FrameStats;
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::view::MAX_EDGE;
 use slabcast_common::volume::{Digest32, VolumeInfo};
-use slabcast_scene::path::{Orientation, ViewPath};
+use slabcast_scene::path::{Fit, Framing, Orientation, ViewPath};
 use slabcast_scene::request::PathRequest;
 use slabcast_scene::tween::Tween;
 use std::path::Path;
@@ -194,6 +194,7 @@ pub fn read(path: &Path) -> Result<Vec<u8>, Fail> {
 }
 
 /// Makes the provenance of each frame of a run.
+#[derive(Clone)]
 pub struct RunProvenance {
     base: Provenance,
     /// With the hash of the linear picture instead of the file's own.
@@ -266,6 +267,18 @@ impl RunProvenance {
             },
             hash_inside: request.hash_inside,
         })
+    }
+
+    /// Returns the provenance of a path that the master gave `framing`: the picture records the
+    /// numbers, not how they were found.
+    #[must_use]
+    pub fn framed(mut self, framing: Option<&Framing>) -> RunProvenance {
+        if let Some(framing) = framing {
+            self.base.path = self.base.path.framed(framing);
+        }
+        // Nothing was there to be fitted to, or all was given.
+        self.base.path.fit = Fit::Volume;
+        self
     }
 
     /// Returns the provenance of the single frame of these statistics.

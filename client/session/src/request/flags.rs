@@ -16,7 +16,7 @@ use slabcast_common::quality::{
 };
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_scene::path::{
-    Axis, Crop, Key, KeyFrames, Orientation, ProjectionKind, Side, Turntable, ViewPath,
+    Axis, Crop, Fit, Key, KeyFrames, Orientation, ProjectionKind, Side, Turntable, ViewPath,
 };
 use std::path::{Path, PathBuf};
 
@@ -94,9 +94,18 @@ pub struct ViewArgs {
     #[arg(long, value_name = "DEG", default_value = "0", value_parser = parse::number,
           allow_negative_numbers = true)]
     elevation: f64,
-    /// World height at the volume's centre [default: 1.25 extents]
+    /// What the picture frames: visible or volume [default: visible]
     ///
-    /// The default is 1.25 times the volume's largest extent.
+    /// visible: what the transfer function shows within --crop is in the middle and fills 85 % of the
+    /// picture; a turn has one framing for all frames. volume: the volume's centre, and 1.25 times its
+    /// largest extent. The default is volume beside --height, and what the file says beside --path.
+    #[arg(long, value_name = "WHAT", hide_possible_values = true,
+          value_parser = words(&[("visible", Fit::Visible), ("volume", Fit::Volume)]))]
+    fit: Option<Fit>,
+    /// World height of the picture [default: as --fit says]
+    ///
+    /// In mm where the file says so. The picture then shows the volume's centre, unless --fit visible
+    /// is given, too.
     #[arg(long, value_name = "H", value_parser = parse::positive, allow_negative_numbers = true)]
     height: Option<f64>,
     /// Parallel or perspective: ortho or persp
@@ -276,9 +285,17 @@ impl SceneArgs {
             None => view.path_from_flags(picture.size.unwrap_or([512, 512]))?,
         };
         path.crop = view.crop.or(path.crop);
+        let usual = match (&view.path, view.height) {
+            (Some(_), _) => path.fit,
+            (None, Some(_)) => Fit::Volume,
+            (None, None) => Fit::Visible,
+        };
+        path.fit = view.fit.unwrap_or(usual);
         path.check().map_err(|e| match &view.path {
-            Some(file) => Fail::field(file, "view path", &e),
-            None => Fail::flag(&e),
+            Some(file) if e.field != "fit" || view.fit.is_none() => {
+                Fail::field(file, "view path", &e)
+            }
+            _ => Fail::flag(&e),
         })?;
         let transfer = Transfer::parse(&picture.tf, &picture.transfer)?;
         Ok(RenderRequest {
@@ -474,6 +491,7 @@ impl ViewArgs {
             step: self.step,
             frames,
             elevation: self.elevation,
+            target: None,
             height: self.height,
             projection: self.projection,
             fov,

@@ -148,7 +148,7 @@ impl RenderRequest {
     /// Returns a refusal that names where the user wrote what is refused: a flag, or a field of a
     /// file.
     pub fn blame(&self, refused: &InvalidField) -> Fail {
-        const FLAGS: [&str; 25] = [
+        const FLAGS: [&str; 26] = [
             "thickness",
             "eps",
             "kernel",
@@ -171,6 +171,7 @@ impl RenderRequest {
             "frames",
             "elevation",
             "height",
+            "fit",
             "fov",
             "up",
             "front",

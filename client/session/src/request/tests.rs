@@ -3,7 +3,7 @@
 use super::*;
 use clap::Parser;
 use slabcast_common::volume::{Digest32, Volume};
-use slabcast_scene::path::{ProjectionKind, Turntable};
+use slabcast_scene::path::{Fit, ProjectionKind, Turntable};
 use slabcast_scene::transfer::TransferChoice;
 
 #[derive(Parser)]
@@ -30,7 +30,16 @@ fn cube() -> VolumeInfo {
 #[test]
 fn defaults_are_those_of_the_contract() {
     let a = asked("").unwrap();
-    assert_eq!(a.path, ViewPath::from_turntable([512, 512], Turntable::default()));
+    let turn = ViewPath::from_turntable([512, 512], Turntable::default());
+    assert_eq!(a.path, ViewPath { fit: Fit::Visible, ..turn });
+    for (line, fit) in [
+        ("--height 9", Fit::Volume),
+        ("--fit volume", Fit::Volume),
+        ("--height 9 --fit visible", Fit::Visible),
+        ("--view left --up z --front y", Fit::Visible),
+    ] {
+        assert_eq!(asked(line).unwrap().path.fit, fit, "{line}");
+    }
     assert_eq!((a.quality, a.work), (Quality::default(), Work::default()));
     let message = a.to_message(&cube(), PixelFormat::Rgb8, false);
     assert_eq!(message.transfer, TransferChoice::Name("auto".into()));

@@ -7,11 +7,13 @@
 
 mod crop;
 mod fly;
+mod framing;
 mod keys;
 mod turn;
 
 pub use crop::{Crop, CropBox, CropUnit};
 pub use fly::FlyThrough;
+pub use framing::{FILL, Fit, Framing};
 pub use keys::{Easing, Key, KeyFrames, MAX_KEYS, Side};
 
 use crate::presets::Levels;
@@ -119,7 +121,7 @@ pub struct PathView {
     pub fov: Option<f64>,
 }
 
-/// A turn about the up axis through the volume's centre.
+/// A turn about the up axis through the target.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Turntable {
@@ -131,7 +133,10 @@ pub struct Turntable {
     pub frames: u32,
     /// Elevation of the eye in degrees towards up, -90 to 90.
     pub elevation: f64,
-    /// World height shown at the target; default 1.25 times the largest extent.
+    /// Point that the eye looks at, in world units; default as [`ViewPath::fit`] says.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub target: Option<[f64; 3]>,
+    /// World height shown at the target; default as [`ViewPath::fit`] says.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub height: Option<f64>,
     /// Kind of projection: parallel or central.
@@ -153,6 +158,7 @@ impl Default for Turntable {
             step: 5.0,
             frames: 18,
             elevation: 0.0,
+            target: None,
             height: None,
             projection: ProjectionKind::Ortho,
             fov: 30.0,
@@ -186,6 +192,9 @@ pub struct ViewPath {
     /// Box outside of which the volume counts as empty; `None` for the whole volume.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub crop: Option<Crop>,
+    /// What target and height of a turntable or of keys are where they have none.
+    #[serde(default, skip_serializing_if = "Fit::is_volume")]
+    pub fit: Fit,
     /// First and last frame that are wanted, both included; all if `None`. Frames keep their
     /// numbers on the whole path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -258,6 +267,7 @@ impl ViewPath {
             keyframes: None,
             flythrough: None,
             crop: None,
+            fit: Fit::Volume,
             range: None,
         }
     }
@@ -318,6 +328,11 @@ impl ViewPath {
         self.keyframes.as_ref().map_or(Ok(()), KeyFrames::check)?;
         self.flythrough.as_ref().map_or(Ok(()), FlyThrough::check)?;
         self.crop.as_ref().map_or(Ok(()), Crop::check)?;
+        if self.fit == Fit::Visible && self.turntable.is_none() && self.keyframes.is_none() {
+            let problem = "goes with a turntable or keyframes: views and flights say themselves \
+                           where they look; leave it out";
+            return Err(InvalidField::new("fit", problem));
+        }
         if let Some([first, last]) = self.range
             && (first > last || last as usize >= self.all_frames())
         {
@@ -491,7 +506,12 @@ impl Turntable {
             },
         };
         let (to_eye, up) = direction(o, t.start + t.step * i as f64, t.elevation);
-        Ok(Camera { to_eye, up, target: DVec3::ZERO, projection })
+        let target = match t.target.map(DVec3::from_array) {
+            None => DVec3::ZERO,
+            Some(target) if target.is_finite() => target - lattice.centre(),
+            Some(_) => return Err(InvalidField::new("target", "must be finite numbers")),
+        };
+        Ok(Camera { to_eye, up, target, projection })
     }
 }
 

@@ -12,6 +12,7 @@ mod watch;
 pub use jobs::{
     Page, job_from_wire, job_to_wire, page_from_wire, page_token, worker_from_wire, worker_to_wire,
 };
+pub use path::{framing_from_wire, framing_to_wire};
 pub use statistics::{StatisticsPart, StatisticsParts};
 pub use submit::{submit_from_wire, submit_to_wire};
 pub use volume::{volume_from_wire, volume_to_wire};

@@ -6,8 +6,8 @@ use super::{axis_from_wire, axis_to_wire, enum_conversions, wire};
 use crate::convert::numbers::{finite, size_from_wire};
 use crate::convert::{WireError, required};
 use slabcast_scene::path::{
-    Crop, CropUnit, Easing, FlyThrough, Key, KeyFrames, MAX_KEYS, PathView, ProjectionKind, Side,
-    Turntable, ViewPath,
+    Crop, CropUnit, Easing, Fit, FlyThrough, Framing, Key, KeyFrames, MAX_KEYS, PathView,
+    ProjectionKind, Side, Turntable, ViewPath,
 };
 
 enum_conversions!(projection_to_wire, projection_from_wire, ProjectionKind, wire::Projection,
@@ -19,6 +19,24 @@ enum_conversions!(side_to_wire, side_from_wire, Side, wire::Side, None,
       Superior <=> Superior, Inferior <=> Inferior });
 enum_conversions!(unit_to_wire, unit_from_wire, CropUnit, wire::CropUnit, Some(CropUnit::World),
     { World <=> World, Unit <=> Fraction });
+enum_conversions!(fit_to_wire, fit_from_wire, Fit, wire::Fit, Some(Fit::Volume),
+    { Volume <=> Volume, Visible <=> Visible });
+
+/// Writes the framing that a path was given.
+pub fn framing_to_wire(framing: &Framing) -> wire::Framing {
+    wire::Framing { target: Some(vec3_to_wire(framing.target)), height: framing.height }
+}
+
+/// Converts the framing that a path was given from its message.
+///
+/// # Errors
+/// [`WireError`] names the field that is missing or not finite.
+pub fn framing_from_wire(framing: wire::Framing) -> Result<Framing, WireError> {
+    Ok(Framing {
+        target: vec3_from_wire("framing.target", required("framing.target", framing.target)?)?,
+        height: finite("framing.height", framing.height)?,
+    })
+}
 
 pub(super) fn path_to_wire(path: &ViewPath) -> wire::ViewPath {
     use wire::view_path::Cameras;
@@ -60,6 +78,7 @@ pub(super) fn path_to_wire(path: &ViewPath) -> wire::ViewPath {
         range: path
             .range
             .map(|[first_frame, last_frame]| wire::FrameRange { first_frame, last_frame }),
+        fit: if path.fit == Fit::default() { 0 } else { fit_to_wire(path.fit) },
     }
 }
 
@@ -69,6 +88,7 @@ pub(super) fn path_from_wire(path: wire::ViewPath) -> Result<ViewPath, WireError
         // Whether its numbers are finite its own check sees.
         crop: path.crop.map(crop_from_wire).transpose().map_err(|e| e.within("crop"))?,
         range: path.range.map(|r| [r.first_frame, r.last_frame]),
+        fit: fit_from_wire("fit", path.fit)?,
         ..ViewPath::from_views(size_from_wire(path.width, path.height)?, Vec::new())
     };
     match required("cameras", path.cameras)? {
@@ -142,6 +162,7 @@ fn turntable_to_wire(t: &Turntable) -> wire::Turntable {
         fov: Some(t.fov),
         up: axis_to_wire(t.up),
         front: axis_to_wire(t.front),
+        target: t.target.map(vec3_to_wire),
     }
 }
 
@@ -152,6 +173,7 @@ fn turntable_from_wire(t: wire::Turntable) -> Result<Turntable, WireError> {
         step: finite("step", t.step.unwrap_or(d.step))?,
         frames: t.frames.unwrap_or(d.frames),
         elevation: finite("elevation", t.elevation.unwrap_or(d.elevation))?,
+        target: t.target.map(|v| vec3_from_wire("target", v)).transpose()?,
         height: t.height.map(|x| finite("height", x)).transpose()?,
         projection: projection_from_wire("projection", t.projection)?,
         fov: finite("fov", t.fov.unwrap_or(d.fov))?,

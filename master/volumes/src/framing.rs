@@ -4,7 +4,7 @@
 //! there above any threshold, and one in a corner would decide the picture. Cutting a share of the
 //! voxels off each side (0.1 %, say) rejects noise too, but takes 3.7 % of a ball's radius and a
 //! tenth of a cone's tip, which the picture then clips. Noise is told by being lonely, so cells of
-//! 8x8x8 voxels count, the bricks of the renderer, and only if at least [`DENSE`] of their voxels
+//! 8x8x8 voxels count, the bricks of the renderer, and only if at least `DENSE` of their voxels
 //! are visible. Voxels of such cells count exactly.
 
 use crate::store::relevance_table;

@@ -58,6 +58,13 @@ impl SingleFrame {
         self.draw_frame(&self.frame(quality), threads)
     }
 
+    /// Draws the picture in another quality, with sheets as thick as that says.
+    pub(crate) fn draw_thick(&self, quality: Quality, threads: usize) -> Picture {
+        let spec = SceneSpec { quality, ..self.spec.clone() };
+        let view = self.drawn_view.with_thickness_of(&quality);
+        self.draw_frame(&Frame::new(Arc::new(Scene::new(&spec)), view), threads)
+    }
+
     /// Draws the picture with no pixel ever shut.
     pub(crate) fn draw_open(&self, threads: usize) -> Picture {
         self.draw_frame(&self.frame(self.spec.quality).never_shut(), threads)

@@ -32,6 +32,7 @@ fn reconstructed_pictures_are_within_one_255th_of_their_limit() {
     let json: serde_json::Value = serde_json::from_str(&said).unwrap();
     let rmse = |source: &str| json[source]["rmse"].as_f64().unwrap_or_else(|| panic!("{json}"));
     assert!(rmse("limit") > 0.0 && rmse("limit") < 1.0, "{json}");
+    assert!(rmse("thickness") > 0.0, "{json}");
     for source in ["thickness", "cutoff", "quantisation", "ripple"] {
         assert!(rmse(source) < 1.0, "{source}: {json}");
     }

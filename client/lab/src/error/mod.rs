@@ -157,8 +157,8 @@ fn measure(args: &ErrorArgs) -> Result<ErrorResult, Fail> {
     }
 }
 
-/// Thickness of the sheets, over that of the picture, against which its planes are compared.
-const THIN: f64 = 8.0;
+/// Thickness of the picture's sheets over that of the sheets which its planes are compared with.
+const THIN: f64 = 4.0;
 
 /// Compares a picture of reconstructed values: cut-off and quantisation by pictures without them,
 /// planes by thinner ones, and all else by the limit.
@@ -181,7 +181,7 @@ fn measure_after(
     let longs = (quality.sums != Sums::I32).then(|| scene.draw(long, threads));
     let longs = longs.as_ref().unwrap_or(opened);
     let thickness = (quality.thickness / THIN).max(1.0 / 64.0);
-    let thin = scene.draw(Quality { thickness, ..long }, threads);
+    let thin = scene.draw_thick(Quality { thickness, ..long }, threads);
 
     let sample = stratified(size, args.pixels.count(size), args.seed);
     progress.frames(sample.len() as u64, &format!("{} pixels of the reference", sample.len()));
@@ -206,7 +206,7 @@ fn measure_after(
     Ok(ErrorResult {
         whole: vec![row("limit", "against the limit: all of it", &got, &limit)],
         sources: vec![
-            row("thickness", "planes against planes of an eighth", &longs, &widen(&thin)),
+            row("thickness", "planes against planes of a quarter", &longs, &widen(&thin)),
             row("cutoff", "pixels shut before they are opaque", &got, &widen(&opened)),
             row("quantisation", "sums of integers", &opened, &widen(&longs)),
             row("ripple", "of kernel sums, and rounding of positions", &thin, &limit),

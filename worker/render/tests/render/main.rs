@@ -14,6 +14,7 @@ mod composite;
 mod error_figures;
 mod error_probe;
 mod explain;
+mod field;
 mod field_reference;
 mod footprint;
 mod general;

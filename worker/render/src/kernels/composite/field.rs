@@ -53,6 +53,8 @@ pub struct FieldScene {
     range: [f64; 2],
     /// Codes of the first and the last cell's ends.
     hull: [f64; 2],
+    /// Cells between which values are visible: a visible end of the hull has no end.
+    visible: [f32; 2],
     kind: SampleKind,
     /// Extinction per vox and linear colour by cell end.
     looks: Box<[OpticalSample; CELLS + 1]>,
@@ -74,6 +76,11 @@ impl FieldScene {
         let hull = hull(classifier, summary);
         let code = |cell: usize| hull[0] + (hull[1] - hull[0]) * (cell as f64 / CELLS as f64);
         let looks: Vec<[f64; 4]> = (0..=CELLS).map(|c| classifier.optics_at(code(c))).collect();
+        let ends = [0, CELLS].map(|cell| looks[cell][0] > 0.0);
+        let visible = [
+            if ends[0] { f32::NEG_INFINITY } else { 0.0 },
+            if ends[1] { f32::INFINITY } else { CELLS as f32 },
+        ];
         let mut integrals = vec![[0.0f64; 4]];
         for pair in looks.windows(2) {
             let mut sum = *integrals.last().expect("the first is there");
@@ -95,6 +102,7 @@ impl FieldScene {
             background,
             range: [summary.min_code, summary.max_code],
             hull,
+            visible,
             kind: summary.kind,
             most: table(looks.iter().map(|look| {
                 most = most.max(look[0]);
@@ -232,11 +240,10 @@ impl FieldRule {
         });
         let [std, radius] = quality.kernel_shape();
         let profile = Profile::new(quality.kernel, std, radius);
-        let last = libm::ceil(radius * FACE_STEPS as f64) as usize;
-        let face = (0..=last + 1).map(|i| {
-            let at = i as f64 / FACE_STEPS as f64;
-            [profile.integral_to(at) as f32, profile.at(at) as f32]
-        });
+        // The outermost samples lie half a step behind the face.
+        let whole = radius + 0.5;
+        let last = libm::ceil(whole * FACE_STEPS as f64) as usize;
+        let face = (0..=last + 1).map(|i| inside(&profile, i as f64 / FACE_STEPS as f64 - 0.5));
         let light = shader.and_then(Shader::light_direction).map(|d| {
             let d = view.eye_from_world * DVec3::new(d.x.into(), d.y.into(), d.z.into());
             d.to_array().map(|x| x as f32)
@@ -255,7 +262,7 @@ impl FieldRule {
             thickness: view.thickness as f32,
             faces,
             face: face.collect(),
-            whole: radius as f32,
+            whole: whole as f32,
             projection: view.projection,
             size: view.size.map(|n| n as f32),
             light,
@@ -319,9 +326,11 @@ impl FieldRule {
         plane
     }
 
-    /// Divides a plane by the kernel's weight inside the volume, near its faces.
+    /// Divides a plane by the kernel's weight inside the volume, near its faces. Returns a bit for
+    /// each lane that lies outside.
     #[inline(always)]
-    fn level(&self, plane: &mut Plane, rays: &Rays, z: f32) {
+    fn level(&self, plane: &mut Plane, rays: &Rays, z: f32) -> u32 {
+        let mut outside = 0;
         for faces in &self.faces {
             let [x, y, d] = faces.along;
             let mut q = [0.0; LANES];
@@ -337,6 +346,7 @@ impl FieldRule {
                 continue;
             }
             for i in 0..LANES {
+                outside |= u32::from((q[i] < faces.lo) | (q[i] > faces.hi)) << i;
                 let [lo, lo_slope] = self.beside_face(q[i] - faces.lo);
                 let [hi, hi_slope] = self.beside_face(faces.hi - q[i]);
                 let weight = (lo * hi).max(LEAST_WEIGHT);
@@ -349,6 +359,7 @@ impl FieldRule {
                 }
             }
         }
+        outside
     }
 
     /// Weight of the kernel on the inner side of a face at this distance from it, and its slope.
@@ -401,8 +412,8 @@ impl FieldRule {
         let z = (k as f32 - 0.5) * h;
         let [mut first, mut last] = [self.plane(&row.before), self.plane(&row.here)];
         let rays = self.rays(pixels);
-        self.level(&mut first, &rays, z);
-        self.level(&mut last, &rays, z + h);
+        let outside =
+            self.level(&mut first, &rays, z) | self.level(&mut last, &rays, z + h) << LANES;
         // Bezier's points: the cubic lies between the smallest and the largest.
         let [mut m0, mut m1, mut low, mut high] = [[0.0f32; LANES]; 4];
         let mut visible = 0;
@@ -411,13 +422,36 @@ impl FieldRule {
             let (sx, sy) = (rays.slope[0][i], rays.slope[1][i]);
             m0[i] = h * (x0[i] * sx + y0[i] * sy + z0[i]);
             m1[i] = h * (x1[i] * sx + y1[i] * sy + z1[i]);
+        }
+        if outside != 0 {
+            // Beyond a face the value goes on straight: few samples reach there.
+            for i in 0..LANES {
+                let [front, back] = [outside >> i & 1, outside >> (LANES + i) & 1];
+                if (front, back) == (1, 0) {
+                    first.value[i] = last.value[i] - m1[i];
+                    m0[i] = m1[i];
+                } else if (front, back) == (0, 1) {
+                    last.value[i] = first.value[i] + m0[i];
+                    m1[i] = m0[i];
+                } else {
+                    continue;
+                }
+                for axis in 0..3 {
+                    let from = if front == 1 { &last } else { &first }.gradient[axis][i];
+                    let to = if front == 1 { &mut first } else { &mut last };
+                    to.gradient[axis][i] = from;
+                }
+            }
+        }
+        for i in 0..LANES {
             let (a, b) = (first.value[i], last.value[i]);
             let (p, q) = (a + m0[i] * (1.0 / 3.0), b - m1[i] * (1.0 / 3.0));
             let (l, m) = (select(a < b, a, b), select(p < q, p, q));
             low[i] = select(l < m, l, m);
             let (l, m) = (select(a < b, b, a), select(p < q, q, p));
             high[i] = select(l < m, m, l);
-            let meets = (high[i] > 0.0) & (low[i] < CELLS as f32) & (row.here[0][i] > 0.0);
+            let meets = (high[i] > scene.visible[0]) & (low[i] < scene.visible[1]);
+            let meets = meets & (row.here[0][i] > 0.0);
             visible |= u32::from(meets) << i;
         }
         visible &= live;
@@ -546,6 +580,23 @@ impl FieldRule {
         shader.terms(&mut lambert, &mut gloss, LANES);
         [lambert, gloss]
     }
+}
+
+/// Share of the kernel's sum over an endless row of samples that the samples from 0 on have, at a
+/// distance `u` of lattice steps from sample 0 towards the others, and its slope per step.
+fn inside(profile: &Profile, u: f64) -> [f32; 2] {
+    let reach = libm::ceil(profile.radius) as i32 + 1;
+    let (mut some, mut all) = ([0.0; 2], [0.0; 2]);
+    let middle = libm::floor(u) as i32;
+    for n in middle - reach..=middle + 1 + reach {
+        let (weight, slope) = (profile.at(u - f64::from(n)), profile.slope_at(u - f64::from(n)));
+        all = [all[0] + weight, all[1] + slope];
+        if n >= 0 {
+            some = [some[0] + weight, some[1] + slope];
+        }
+    }
+    let share = some[0] / all[0];
+    [share as f32, ((some[1] - share * all[1]) / all[0]) as f32]
 }
 
 /// The cubic with two `values` and two `slopes` (over the whole segment) at share `t`.

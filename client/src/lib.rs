@@ -135,7 +135,7 @@ impl Client {
     /// job's name.
     ///
     /// # Errors
-    /// As [`Client::submit`].
+    /// See [`Client::submit`].
     pub async fn submit_framed(&self, request: &PathRequest) -> Result<Submitted, ClientError> {
         request.path.check().map_err(|e| ClientError::InvalidField {
             field: convert::wire_field(&e.field, &request.path),

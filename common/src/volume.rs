@@ -301,8 +301,8 @@ pub struct ValueSummary {
     /// then of a body.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub anatomical: bool,
-    /// Where nearly all codes are, if a few, or the padding around a scan, lie so far away that the
-    /// range says nothing of the rest.
+    /// Range of nearly all codes. Set if outliers or padding stretch the full range so far that it
+    /// does not describe the rest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub core: Option<ValueCore>,
 }

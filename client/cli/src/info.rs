@@ -311,7 +311,7 @@ fn json(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
     })
 }
 
-/// What presets are fitted to.
+/// Returns the summary of the values that presets are fitted to, as JSON.
 fn presets_by(s: &ValueSummary) -> serde_json::Value {
     let levels = Levels::from_summary(s);
     let (from, to) = s.core_range();

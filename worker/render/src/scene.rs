@@ -96,7 +96,7 @@ pub struct Frame {
     #[doc(hidden)]
     pub footprints: Footprints,
     pub(crate) rule: Rule,
-    /// How a field's planes become light; `None` where voxels are classified before they are
+    /// Compositing rule of a field; `None` if voxels are classified before they are
     /// splatted.
     #[doc(hidden)]
     pub field: Option<Arc<FieldRule>>,

@@ -94,7 +94,7 @@ pub struct ViewArgs {
     #[arg(long, value_name = "DEG", default_value = "0", value_parser = parse::number,
           allow_negative_numbers = true)]
     elevation: f64,
-    /// What the picture frames: visible or volume [default: visible]
+    /// Content to frame: visible or volume [default: visible]
     ///
     /// visible: what the transfer function shows within --crop is in the middle and fills 85 % of the
     /// picture; a turn has one framing for all frames. volume: the volume's centre, and 1.25 times its

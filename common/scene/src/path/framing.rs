@@ -8,7 +8,7 @@
 //! cameras and the shape of the picture, and on nothing else: masters and programs come to the same
 //! numbers.
 //!
-//! What can be seen is given as index positions whose hull holds it
+//! Visible content is given as index positions whose hull holds it
 //! (`slabcast_volumes::framing::outline`). Each is projected by [`View`], as the renderer does it:
 //!
 //! 1. In every frame the points' extent has a middle. The target is the point whose distances from
@@ -43,14 +43,14 @@ const MOST: usize = 720;
 /// volume, the third by less than a pixel of a picture of 512.
 const ROUNDS: usize = 4;
 
-/// What the cameras of a path are fitted to where the path has no target and height.
+/// Content that the cameras of a path frame if the path gives no target and height.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Fit {
     /// The volume's box: its centre, and 1.25 times its largest extent.
     #[default]
     Volume,
-    /// What the transfer function shows within the crop.
+    /// The voxels inside the crop that the transfer function makes visible.
     Visible,
 }
 

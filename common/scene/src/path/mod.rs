@@ -192,7 +192,7 @@ pub struct ViewPath {
     /// Box outside of which the volume counts as empty; `None` for the whole volume.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub crop: Option<Crop>,
-    /// What target and height of a turntable or of keys are where they have none.
+    /// Content that a turntable or keys without target and height frame.
     #[serde(default, skip_serializing_if = "Fit::is_volume")]
     pub fit: Fit,
     /// First and last frame that are wanted, both included; all if `None`. Frames keep their

@@ -58,7 +58,7 @@ const WARM: [[f64; 4]; 4] = [
     [128.0, 0.97, 0.86, 0.76],
     [255.0, 1.0, 0.97, 0.92],
 ];
-/// Of what may be anything.
+/// Colours for values of unknown origin.
 const STONE: [[f64; 4]; 3] =
     [[0.0, 0.80, 0.77, 0.72], [128.0, 0.89, 0.87, 0.83], [255.0, 1.0, 0.99, 0.96]];
 const RED: [[f64; 4]; 4] = [

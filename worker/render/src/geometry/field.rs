@@ -165,7 +165,7 @@ pub(crate) fn accepts_apart(frame: &Frame) -> bool {
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Apart {
     placed: Placed,
-    /// What it adds for each unit of weight, in raw units.
+    /// Contribution to a sum for a weight of one, in raw units.
     payload: f32,
 }
 

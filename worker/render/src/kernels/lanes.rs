@@ -99,6 +99,7 @@ pub(crate) trait Floats: Lanes {
     unsafe fn sub(a: Self::Floats, b: Self::Floats) -> Self::Floats;
     unsafe fn mul(a: Self::Floats, b: Self::Floats) -> Self::Floats;
     unsafe fn div(a: Self::Floats, b: Self::Floats) -> Self::Floats;
+    unsafe fn sqrt(a: Self::Floats) -> Self::Floats;
     /// `a` if it is less, else `b`.
     unsafe fn least(a: Self::Floats, b: Self::Floats) -> Self::Floats;
     /// `a` if it is more, else `b`.
@@ -113,6 +114,7 @@ pub(crate) trait Floats: Lanes {
     /// The bits of each.
     unsafe fn to_bits(a: Self::Floats) -> Self::Ints;
     unsafe fn from_bits(a: Self::Ints) -> Self::Floats;
+    unsafe fn to_floats(a: Self::Ints) -> Self::Floats;
     /// Whole numbers, towards zero, of what is below 2^31.
     unsafe fn truncated(a: Self::Floats) -> Self::Ints;
 }

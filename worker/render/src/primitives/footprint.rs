@@ -71,7 +71,7 @@ pub struct Leaning {
 impl Leaning {
     /// For sheets of the thickness of `view`, cut by `sections`, of a kernel with profile `deep`
     /// along the depth; `scale`: pixels a vox at most.
-    /// Of a field, planes lie beside their voxels and not sections.
+    /// Fields have planes, other scenes have sections.
     pub(crate) fn new(view: &View, deep: &Profile, sections: &Sections, scale: f64) -> Leaning {
         let (lean, thickness) = (&view.kernel_lean, view.thickness);
         // Where two spacings are alike but for their last digits rows and sections lie aside by
@@ -196,7 +196,7 @@ struct AxisTable {
     weights: Vec<Tap>,
     /// Weights in lattice steps, as fixed point.
     fixed: Vec<i16>,
-    /// The same for the four channels of a field, along x and along y; empty where there is none.
+    /// Weights of the four channels of a field, along x and along y; empty for other scenes.
     field: [FieldTaps; 2],
     /// Weights of a phase at most.
     stride: usize,

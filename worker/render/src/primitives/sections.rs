@@ -51,7 +51,7 @@ fn whole_phases(profile: &Profile, thickness: f64, phases: i32) -> i32 {
     libm::ceil(profile.radius / thickness * f64::from(phases) * (1.0 - 1e-12)) as i32
 }
 
-/// How far before and behind a voxel's depth, in phases, it is drawn where slivers are given away;
+/// Reach of a voxel before and behind its depth, in phases, if slivers are dropped;
 /// `None` where they are no slivers.
 fn kept(profile: &Profile, thickness: f64, phases: i32) -> Option<(i32, i32)> {
     let radius = whole_phases(profile, thickness, phases);

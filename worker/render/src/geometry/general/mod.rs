@@ -155,7 +155,7 @@ impl<S: FieldSum> Work for RenderGeneralField<'_, S> {
     }
 }
 
-/// What sheets hold: sections of classified voxels, or planes of a field.
+/// Content of a sheet: sections of classified voxels, or planes of a field.
 trait Contents<S: Accumulate> {
     /// Adds the voxels of `bucket` to their sheets from sheet `k` on.
     fn splat_all(

@@ -5,32 +5,32 @@
 //! linear. The segment is cut into sub-steps; the transfer function is integrated over each as if
 //! the value were linear in it (pre-integration: K. Engel et al., 2001), light falls on its middle.
 //! docs/design/sharp.md has the alternatives and what each costs.
+//!
+//! [`FieldRule::close_pixel`] is the plain version. [`lanes`] does the same operations in the same
+//! order on registers of x86, so that both give the same bytes.
 
-use super::{LANES, Row, fixed_light, select};
-use crate::kernels::{Simd, lut, truncate};
+#[cfg(target_arch = "x86_64")]
+mod lanes;
+mod tables;
+
+pub use tables::FieldScene;
+
+use super::{LANES, Row, fixed_light};
+#[cfg(target_arch = "x86_64")]
+use crate::kernels::Level;
+use crate::kernels::Simd;
 use glam::{DMat3, DVec3};
 use slabcast_common::kernel::Profile;
 use slabcast_common::math::opacity;
-use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::shade::Shader;
-use slabcast_common::transfer::{Classifier, OpticalSample};
 use slabcast_common::view::{Projection, View};
-use slabcast_common::volume::{SampleKind, ValueSummary};
-
-/// Cells of the tables over the visible values.
-const CELLS: usize = 4096;
-
-/// Cells that a sub-step's values must span for the integral tables to be used. Within fewer the
-/// transfer function is taken where the middle is; differences of f32 integrals would lose digits.
-const FEW_CELLS: f32 = 16.0;
-
-/// Sub-steps of a segment at most.
-const MOST_STEPS: f32 = 8.0;
+use slabcast_common::volume::SampleKind;
+use tables::CELLS;
 
 /// Terms of the number of sub-steps m, `m^2 >= a (K0 + K1 (1 - c) + K2 r)` for the light `a` that a
 /// segment can add, the cosine `c` between its gradients, and the range `r` of its values in 1/255
-/// of all values. On twelve scenes no more than 0.054/255 is lost against m = 8.
+/// of all values. On twelve scenes no more than 0.054/255 is lost against m = 8, which is the most.
 const STEPS: [f32; 3] = [100.0, 8000.0, 2.0];
 
 /// The gradient per vox, as a share of the range of all values, that a surface must have for its
@@ -44,101 +44,6 @@ const LEAST_WEIGHT: f32 = 0.25;
 /// Steps of the table of a kernel's weight near a face, for each lattice step.
 const FACE_STEPS: usize = 32;
 
-/// Values of a scene: how codes become sums, and what values look like.
-#[derive(Debug)]
-pub struct FieldScene {
-    /// Code of which a sheet holds nothing: the smallest code of the volume, or the largest.
-    background: f64,
-    /// Smallest and largest code.
-    range: [f64; 2],
-    /// Codes of the first and the last cell's ends.
-    hull: [f64; 2],
-    /// Cells between which values are visible: a visible end of the hull has no end.
-    visible: [f32; 2],
-    kind: SampleKind,
-    /// Extinction per vox and linear colour by cell end.
-    looks: Box<[OpticalSample; CELLS + 1]>,
-    /// Integrals of extinction, and of extinction times colour, up to each cell's end, in cells.
-    integrals: Box<[OpticalSample; CELLS + 1]>,
-    /// Largest extinction per vox up to each cell's end.
-    most: Box<[f32; CELLS + 1]>,
-}
-
-impl FieldScene {
-    /// Prepares the values of the scene that `spec` describes.
-    pub fn new(spec: &SceneSpec, classifier: &Classifier) -> FieldScene {
-        let summary = &spec.volume.summary;
-        let support = classifier.support();
-        let background = match support.filled(summary).intervals.first() {
-            Some((lo, _)) if *lo == f64::NEG_INFINITY => summary.max_code,
-            _ => summary.min_code,
-        };
-        let hull = hull(classifier, summary);
-        let code = |cell: usize| hull[0] + (hull[1] - hull[0]) * (cell as f64 / CELLS as f64);
-        let looks: Vec<[f64; 4]> = (0..=CELLS).map(|c| classifier.optics_at(code(c))).collect();
-        let ends = [0, CELLS].map(|cell| looks[cell][0] > 0.0);
-        let visible = [
-            if ends[0] { f32::NEG_INFINITY } else { 0.0 },
-            if ends[1] { f32::INFINITY } else { CELLS as f32 },
-        ];
-        let mut integrals = vec![[0.0f64; 4]];
-        for pair in looks.windows(2) {
-            let mut sum = *integrals.last().expect("the first is there");
-            let [a, b] = [pair[0][0], pair[1][0]];
-            sum[0] += 0.5 * (a + b);
-            for c in 1..4 {
-                // Simpson's rule of the product of two linear functions is exact.
-                let middle = (a + b) * (pair[0][c] + pair[1][c]);
-                sum[c] += (a * pair[0][c] + middle + b * pair[1][c]) / 6.0;
-            }
-            integrals.push(sum);
-        }
-        let mut most = 0.0f64;
-        let sample = |[sigma, rgb @ ..]: [f64; 4]| OpticalSample {
-            sigma: sigma as f32,
-            rgb: rgb.map(|c| c as f32),
-        };
-        FieldScene {
-            background,
-            range: [summary.min_code, summary.max_code],
-            hull,
-            visible,
-            kind: summary.kind,
-            most: table(looks.iter().map(|look| {
-                most = most.max(look[0]);
-                most as f32
-            })),
-            looks: table(looks.iter().copied().map(sample)),
-            integrals: table(integrals.into_iter().map(sample)),
-        }
-    }
-
-    /// Codes from the smallest to the largest.
-    fn span(&self) -> f64 {
-        (self.range[1] - self.range[0]).max(f64::MIN_POSITIVE)
-    }
-}
-
-/// A table of all cells' ends.
-fn table<T: Copy>(entries: impl Iterator<Item = T>) -> Box<[T; CELLS + 1]> {
-    let all: Box<[T]> = entries.collect();
-    all.try_into().unwrap_or_else(|_| unreachable!("an entry for each end of a cell"))
-}
-
-/// Smallest and largest code between which a value may be visible.
-fn hull(classifier: &Classifier, summary: &ValueSummary) -> [f64; 2] {
-    let support = classifier.support();
-    let (lo, hi) = match (support.intervals.first(), support.intervals.last()) {
-        (Some(&(lo, _)), Some(&(_, hi))) => (lo, hi),
-        _ => (summary.min_code, summary.max_code),
-    };
-    // The transfer function is linear between codes: of whole codes it begins to show within one.
-    let beside = if summary.kind == SampleKind::F32 { 0.0 } else { 1.0 };
-    let clamp = |code: f64| code.clamp(summary.min_code, summary.max_code);
-    let [lo, hi] = [clamp(lo - beside), clamp(hi + beside)];
-    if hi > lo { [lo, hi] } else { [lo, lo + 1.0] }
-}
-
 /// Two parallel planes between which the field is drawn: the faces of the volume along an index
 /// axis.
 #[derive(Clone, Copy, Debug)]
@@ -151,7 +56,7 @@ struct Faces {
     hi: f32,
 }
 
-/// How the planes of a field become light, with the constants of one view.
+/// Compositing rule for the planes of a field, with the constants of one view.
 #[derive(Debug)]
 pub struct FieldRule {
     /// Raw units of a sum for one code; times the lattice's cell and over the factors of the
@@ -173,7 +78,7 @@ pub struct FieldRule {
     faces: [Faces; 3],
     /// Weight of a kernel on one side of a face by distance, and its slope per lattice step.
     face: Box<[[f32; 2]]>,
-    /// Where the weight is one, in lattice steps from a face.
+    /// Distance from a face beyond which the weight is one, in lattice steps.
     whole: f32,
     projection: Projection,
     size: [f32; 2],
@@ -182,18 +87,34 @@ pub struct FieldRule {
     eps: f32,
 }
 
-/// One pixel's ray by depth z: `(at + slope z, z)`, in eye coordinates.
-#[derive(Clone, Copy, Default)]
-struct Rays {
-    at: [[f32; LANES]; 2],
-    slope: [[f32; LANES]; 2],
+/// A pixel's ray by depth z: `(at + slope z, z)`, in eye coordinates.
+struct Ray {
+    at: [f32; 2],
+    slope: [f32; 2],
+    /// Unit direction to the eye.
+    to_eye: [f32; 3],
 }
 
-/// The field at one plane in lanes: value in cells, gradient in cells per vox by the eye's axes.
+/// The field at one plane: value in cells, gradient in cells per vox by the eye's axes.
 #[derive(Clone, Copy)]
 struct Plane {
-    value: [f32; LANES],
-    gradient: [[f32; LANES]; 3],
+    value: f32,
+    gradient: [f32; 3],
+}
+
+/// A ray between two planes: a cubic with both values, and both slopes over the whole segment.
+struct Segment {
+    planes: [Plane; 2],
+    slopes: [f32; 2],
+}
+
+impl Segment {
+    /// Smallest and largest of the cubic's Bezier points, between which its values lie.
+    fn bounds(&self) -> [f32; 2] {
+        let Segment { planes: [first, last], slopes: [m0, m1] } = self;
+        let points = [first.value + m0 * (1.0 / 3.0), last.value - m1 * (1.0 / 3.0), last.value];
+        points.iter().fold([first.value; 2], |[low, high], &p| [low.min(p), high.max(p)])
+    }
 }
 
 impl FieldRule {
@@ -290,80 +211,66 @@ impl FieldRule {
         (code - self.background).abs() * self.scale
     }
 
-    /// The rays of the pixels at columns and rows of the picture.
+    /// The ray of the pixel at a column and a row of the picture.
     #[inline(always)]
-    fn rays(&self, pixels: &[[i32; 2]; LANES]) -> Rays {
-        let mut rays = Rays::default();
+    fn ray(&self, pixel: [i32; 2]) -> Ray {
+        let mut ray = Ray { at: [0.0; 2], slope: [0.0; 2], to_eye: [0.0; 3] };
         for axis in 0..2 {
-            for i in 0..LANES {
-                let p = pixels[i][axis] as f32 + 0.5 - self.size[axis] * 0.5;
-                match self.projection {
-                    Projection::Ortho { scale } => rays.at[axis][i] = p / scale as f32,
-                    Projection::Persp { focal, distance } => {
-                        let slope = p / focal as f32;
-                        rays.slope[axis][i] = slope;
-                        rays.at[axis][i] = slope * distance as f32;
-                    }
+            let p = pixel[axis] as f32 + 0.5 - self.size[axis] * 0.5;
+            match self.projection {
+                Projection::Ortho { scale } => ray.at[axis] = p / scale as f32,
+                Projection::Persp { focal, distance } => {
+                    ray.slope[axis] = p / focal as f32;
+                    ray.at[axis] = ray.slope[axis] * distance as f32;
                 }
             }
         }
-        rays
+        let [sx, sy] = ray.slope;
+        let per_length = -1.0 / (sx * sx + sy * sy + 1.0).sqrt();
+        ray.to_eye = [sx * per_length, sy * per_length, per_length];
+        ray
     }
 
-    /// A plane's raw sums as the field.
+    /// A plane's raw sums as the field. The value is counted from the background.
     #[inline(always)]
-    fn plane(&self, sums: &[[f32; LANES]; 4]) -> Plane {
-        let mut plane = Plane { value: [0.0; LANES], gradient: [[0.0; LANES]; 3] };
-        for i in 0..LANES {
-            plane.value[i] = self.cell[0] + sums[0][i] * self.cell[1];
-        }
+    fn plane(&self, [value, x, y, z]: [f32; 4]) -> Plane {
+        let mut plane = Plane { value: value * self.cell[1], gradient: [0.0; 3] };
         for axis in 0..3 {
-            let [x, y, z] = [self.slopes[0][axis], self.slopes[1][axis], self.slopes[2][axis]];
-            for i in 0..LANES {
-                plane.gradient[axis][i] = sums[1][i] * x + sums[2][i] * y + sums[3][i] * z;
-            }
+            let [from_x, from_y, from_z] = [0, 1, 2].map(|column| self.slopes[column][axis]);
+            plane.gradient[axis] = x * from_x + y * from_y + z * from_z;
         }
         plane
     }
 
-    /// Divides a plane by the kernel's weight inside the volume, near its faces. Returns a bit for
-    /// each lane that lies outside.
+    /// Index coordinates of a ray at depth `z`.
     #[inline(always)]
-    fn level(&self, plane: &mut Plane, rays: &Rays, z: f32) -> u32 {
-        let mut outside = 0;
-        for faces in &self.faces {
+    fn index(&self, ray: &Ray, z: f32) -> [f32; 3] {
+        let [ex, ey] = [0, 1].map(|axis| ray.at[axis] + ray.slope[axis] * z);
+        self.faces.map(|faces| {
             let [x, y, d] = faces.along;
-            let mut q = [0.0; LANES];
-            let mut near = false;
-            for i in 0..LANES {
-                let ex = rays.at[0][i] + rays.slope[0][i] * z;
-                let ey = rays.at[1][i] + rays.slope[1][i] * z;
-                q[i] = x * ex + y * ey + d * z + faces.from;
-                near |= q[i] - faces.lo < self.whole;
-                near |= faces.hi - q[i] < self.whole;
-            }
-            if !near {
-                continue;
-            }
-            for i in 0..LANES {
-                outside |= u32::from((q[i] < faces.lo) | (q[i] > faces.hi)) << i;
-                let [lo, lo_slope] = self.beside_face(q[i] - faces.lo);
-                let [hi, hi_slope] = self.beside_face(faces.hi - q[i]);
-                let weight = (lo * hi).max(LEAST_WEIGHT);
-                let slope = (lo_slope * hi - lo * hi_slope) / weight;
-                let value = (plane.value[i] - self.cell[0]) / weight;
-                plane.value[i] = self.cell[0] + value;
-                for (axis, along) in faces.along.into_iter().enumerate() {
-                    let gradient = &mut plane.gradient[axis][i];
-                    *gradient = *gradient / weight - value * slope * along;
-                }
+            x * ex + y * ey + d * z + faces.from
+        })
+    }
+
+    /// Divides the plane at index coordinates `q` by the kernel's weight inside the volume, near
+    /// its faces. Returns whether the plane lies outside there.
+    fn level(&self, plane: &mut Plane, q: [f32; 3]) -> bool {
+        let mut outside = false;
+        for (faces, q) in self.faces.iter().zip(q) {
+            outside |= (q < faces.lo) | (q > faces.hi);
+            let [lo, lo_slope] = self.beside_face(q - faces.lo);
+            let [hi, hi_slope] = self.beside_face(faces.hi - q);
+            let weight = (lo * hi).max(LEAST_WEIGHT);
+            let slope = (lo_slope * hi - lo * hi_slope) / weight;
+            plane.value /= weight;
+            for (gradient, along) in plane.gradient.iter_mut().zip(faces.along) {
+                *gradient = *gradient / weight - plane.value * slope * along;
             }
         }
         outside
     }
 
     /// Weight of the kernel on the inner side of a face at this distance from it, and its slope.
-    #[inline(always)]
     fn beside_face(&self, distance: f32) -> [f32; 2] {
         let at = distance.clamp(0.0, self.whole) * FACE_STEPS as f32;
         let i = (at as usize).min(self.face.len() - 2);
@@ -372,25 +279,54 @@ impl FieldRule {
         [a[0] + (b[0] - a[0]) * t, a[1] + (b[1] - a[1]) * t]
     }
 
-    /// Cuts the segment from `z` on, of one thickness, at the volume's faces: shares of it.
-    #[inline(always)]
-    fn clip(&self, rays: &Rays, z: f32) -> [[f32; LANES]; 2] {
-        let [mut from, mut to] = [[0.0f32; LANES], [1.0f32; LANES]];
-        for faces in &self.faces {
-            let [x, y, d] = faces.along;
-            for i in 0..LANES {
-                let ex = rays.at[0][i] + rays.slope[0][i] * z;
-                let ey = rays.at[1][i] + rays.slope[1][i] * z;
-                let q = x * ex + y * ey + d * z + faces.from;
-                let step = (x * rays.slope[0][i] + y * rays.slope[1][i] + d) * self.thickness;
-                let step = select(step.abs() < 1e-12, 1e-12, step);
-                let (a, b) = ((faces.lo - q) / step, (faces.hi - q) / step);
-                let (enter, leave) = (select(a < b, a, b), select(a < b, b, a));
-                from[i] = select(enter > from[i], enter, from[i]);
-                to[i] = select(leave < to[i], leave, to[i]);
+    /// Makes the segment from depth `z` on end at the volume's faces, where it is near them: levels
+    /// its planes, and continues the field straight to a plane that lies outside, where few samples
+    /// reach. Returns the part of the segment that is inside, in shares of it.
+    fn end_at_faces(&self, segment: &mut Segment, ray: &Ray, z: f32) -> [f32; 2] {
+        let [front, back] = [z, z + self.thickness].map(|z| self.index(ray, z));
+        let near = |q: [f32; 3]| {
+            let mut faces = self.faces.iter().zip(q);
+            faces.any(|(f, q)| (q - f.lo < self.whole) | (f.hi - q < self.whole))
+        };
+        if !near(front) & !near(back) {
+            return [0.0, 1.0];
+        }
+        let Segment { planes: [first, last], slopes } = segment;
+        let outside = [self.level(first, front), self.level(last, back)];
+        *slopes = [self.along(ray, first), self.along(ray, last)];
+        match outside {
+            [true, false] => {
+                first.value = last.value - slopes[1];
+                (first.gradient, slopes[0]) = (last.gradient, slopes[1]);
             }
+            [false, true] => {
+                last.value = first.value + slopes[0];
+                (last.gradient, slopes[1]) = (first.gradient, slopes[0]);
+            }
+            _ => {}
+        }
+        self.clip(ray, front)
+    }
+
+    /// Cuts the segment that begins at index coordinates `q` at the volume's faces: shares of it.
+    fn clip(&self, ray: &Ray, q: [f32; 3]) -> [f32; 2] {
+        let [mut from, mut to] = [0.0f32, 1.0f32];
+        for (faces, q) in self.faces.iter().zip(q) {
+            let [x, y, d] = faces.along;
+            let step = (x * ray.slope[0] + y * ray.slope[1] + d) * self.thickness;
+            let step = if step.abs() < 1e-12 { 1e-12 } else { step };
+            let (a, b) = ((faces.lo - q) / step, (faces.hi - q) / step);
+            from = from.max(a.min(b));
+            to = to.min(a.max(b));
         }
         [from, to]
+    }
+
+    /// Returns the change of a plane's value along a ray over one thickness.
+    #[inline(always)]
+    fn along(&self, ray: &Ray, plane: &Plane) -> f32 {
+        let [x, y, z] = plane.gradient;
+        self.thickness * (x * ray.slope[0] + y * ray.slope[1] + z)
     }
 
     /// Adds to each pixel of `row` what its ray meets between plane k - 1 (`before`) and plane `k`
@@ -402,183 +338,126 @@ impl FieldRule {
     pub fn close_row(
         &self,
         simd: Simd,
-        (scene, shader): (&FieldScene, Option<&Shader>),
+        looks: (&FieldScene, Option<&Shader>),
         row: &mut Row,
-        (pixels, k): (&[[i32; 2]; LANES], i32),
+        at: (&[[i32; 2]; LANES], i32),
         live: u32,
     ) -> u32 {
         row.light = [[0; LANES]; 3];
-        let h = self.thickness;
-        let z = (k as f32 - 0.5) * h;
-        let [mut first, mut last] = [self.plane(&row.before), self.plane(&row.here)];
-        let rays = self.rays(pixels);
-        let outside =
-            self.level(&mut first, &rays, z) | self.level(&mut last, &rays, z + h) << LANES;
-        // Bezier's points: the cubic lies between the smallest and the largest.
-        let [mut m0, mut m1, mut low, mut high] = [[0.0f32; LANES]; 4];
-        let mut visible = 0;
-        for i in 0..LANES {
-            let ([x0, y0, z0], [x1, y1, z1]) = (&first.gradient, &last.gradient);
-            let (sx, sy) = (rays.slope[0][i], rays.slope[1][i]);
-            m0[i] = h * (x0[i] * sx + y0[i] * sy + z0[i]);
-            m1[i] = h * (x1[i] * sx + y1[i] * sy + z1[i]);
-        }
-        if outside != 0 {
-            // Beyond a face the value goes on straight: few samples reach there.
-            for i in 0..LANES {
-                let [front, back] = [outside >> i & 1, outside >> (LANES + i) & 1];
-                if (front, back) == (1, 0) {
-                    first.value[i] = last.value[i] - m1[i];
-                    m0[i] = m1[i];
-                } else if (front, back) == (0, 1) {
-                    last.value[i] = first.value[i] + m0[i];
-                    m1[i] = m0[i];
-                } else {
-                    continue;
+        match simd.0 {
+            // SAFETY: the value proves that the instructions are there.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe { lanes::avx512(self, looks, row, at, live) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { lanes::avx2(self, looks, row, at, live) },
+            _ => {
+                let mut shut = 0;
+                for i in (0..LANES).filter(|i| live >> i & 1 == 1) {
+                    self.close_pixel(looks, (row, i), (at.0[i], at.1));
+                    shut |= u32::from(1.0 - row.a[i] < self.eps) << i;
                 }
-                for axis in 0..3 {
-                    let from = if front == 1 { &last } else { &first }.gradient[axis][i];
-                    let to = if front == 1 { &mut first } else { &mut last };
-                    to.gradient[axis][i] = from;
-                }
+                shut
             }
         }
-        for i in 0..LANES {
-            let (a, b) = (first.value[i], last.value[i]);
-            let (p, q) = (a + m0[i] * (1.0 / 3.0), b - m1[i] * (1.0 / 3.0));
-            let (l, m) = (select(a < b, a, b), select(p < q, p, q));
-            low[i] = select(l < m, l, m);
-            let (l, m) = (select(a < b, b, a), select(p < q, q, p));
-            high[i] = select(l < m, m, l);
-            let meets = (high[i] > scene.visible[0]) & (low[i] < scene.visible[1]);
-            let meets = meets & (row.here[0][i] > 0.0);
-            visible |= u32::from(meets) << i;
-        }
-        visible &= live;
-        if visible == 0 {
-            return 0;
-        }
-        let [from, to] = self.clip(&rays, z);
-        let (ends, _) = cells(&high);
-        let mut top = [0.0f32; LANES];
-        for i in 0..LANES {
-            top[i] = scene.most[ends[i] as usize % CELLS + 1];
-        }
-        let mut steps = [0.0f32; LANES];
-        let mut most = 0.0f32;
-        for i in 0..LANES {
-            let share = (1.0 - row.a[i]) * select(h * top[i] < 1.0, h * top[i], 1.0);
-            let ([x0, y0, z0], [x1, y1, z1]) = (&first.gradient, &last.gradient);
-            let flat = self.flat * self.flat;
-            let square0 = x0[i] * x0[i] + y0[i] * y0[i] + z0[i] * z0[i] + flat;
-            let square1 = x1[i] * x1[i] + y1[i] * y1[i] + z1[i] * z1[i] + flat;
-            let both = x0[i] * x1[i] + y0[i] * y1[i] + z0[i] * z1[i] + flat;
-            let cosine = both / (square0 * square1).sqrt();
-            let range = (high[i] - low[i]) * self.range_per_cell;
-            let square = share * (STEPS[0] + STEPS[1] * (1.0 - cosine) + STEPS[2] * range);
-            let m = select(square > 1.0, 2.0, 1.0);
-            let m = select(square > 4.0, 4.0, m);
-            let m = select(square > 16.0, MOST_STEPS, m);
-            let inside = (visible >> i & 1 == 1) & (to[i] > from[i]);
-            steps[i] = select(inside, m, 0.0);
-            most = if steps[i] > most { steps[i] } else { most };
-        }
-        let mut light = [[0.0f32; LANES]; 3];
-        let mut value = [0.0f32; LANES];
-        let mut step = [0.0f32; LANES];
-        for i in 0..LANES {
-            step[i] = (to[i] - from[i]) / steps[i].max(1.0);
-            value[i] = hermite([first.value[i], last.value[i]], [m0[i], m1[i]], from[i]);
-        }
-        let mut integral = None;
-        for j in 0..most as u32 {
-            let [mut middle, mut next, mut active] = [[0.0f32; LANES]; 3];
-            for i in 0..LANES {
-                active[i] = select((j as f32) < steps[i], 1.0, 0.0);
-                let begin = from[i] + j as f32 * step[i];
-                middle[i] = begin + 0.5 * step[i];
-                next[i] = hermite([first.value[i], last.value[i]], [m0[i], m1[i]], begin + step[i]);
-            }
-            let looks = scene.between(simd, [&value, &next], &mut integral);
-            value = next;
-            let terms = shader.map(|shader| self.terms(shader, [&first, &last], &middle, &rays));
-            let mut seen = [0.0f32; LANES];
-            for i in 0..LANES {
-                let tau = looks[0][i] * h * step[i] * row.secant[i] * active[i];
-                seen[i] = (1.0 - row.a[i]) * opacity(tau);
-                row.a[i] += seen[i];
-            }
-            for c in 0..3 {
-                for i in 0..LANES {
-                    let base = looks[c + 1][i];
-                    let lit = match &terms {
-                        Some([lambert, gloss]) => base * lambert[i] + gloss[i],
-                        None => base,
-                    };
-                    let lit = select(lit > 0.0, lit, 0.0);
-                    light[c][i] += seen[i] * select(lit < 1.0, lit, 1.0);
-                }
-            }
-        }
-        let mut shut = 0;
-        for i in 0..LANES {
-            for c in 0..3 {
-                row.light[c][i] = fixed_light(light[c][i]);
-            }
-            shut |= u32::from(1.0 - row.a[i] < self.eps) << i;
-        }
-        shut & live
     }
 
-    /// Factors of base colours and what is added, at shares `t` of a segment.
-    #[inline(always)]
-    fn terms(
+    /// Does for lane `i` of a row what [`FieldRule::close_row`] does for all.
+    fn close_pixel(
         &self,
-        shader: &Shader,
-        [first, last]: [&Plane; 2],
-        t: &[f32; LANES],
-        rays: &Rays,
-    ) -> [[f32; LANES]; 2] {
-        let [mut lambert, mut gloss] = [[0.0f32; LANES]; 2];
-        let ([x0, y0, z0], [x1, y1, z1]) = (&first.gradient, &last.gradient);
-        let [mut nx, mut ny, mut nz] = [[0.0f32; LANES]; 3];
-        let [mut ex, mut ey, mut ez] = [[0.0f32; LANES]; 3];
-        for i in 0..LANES {
-            let gx = x0[i] + (x1[i] - x0[i]) * t[i];
-            let gy = y0[i] + (y1[i] - y0[i]) * t[i];
-            let gz = z0[i] + (z1[i] - z0[i]) * t[i];
-            // To the eye, against the ray.
-            let (sx, sy) = (rays.slope[0][i], rays.slope[1][i]);
-            let per_length = -1.0 / (sx * sx + sy * sy + 1.0).sqrt();
-            (ex[i], ey[i], ez[i]) = (sx * per_length, sy * per_length, per_length);
-            let facing = gx * ex[i] + gy * ey[i] + gz * ez[i];
-            let side = select(facing < 0.0, -1.0, 1.0);
-            let x = gx * side + self.flat * ex[i];
-            let y = gy * side + self.flat * ey[i];
-            let z = gz * side + self.flat * ez[i];
-            let per_length = 1.0 / (x * x + y * y + z * z).sqrt();
-            (nx[i], ny[i], nz[i]) = (x * per_length, y * per_length, z * per_length);
+        (scene, shader): (&FieldScene, Option<&Shader>),
+        (row, i): (&mut Row, usize),
+        (pixel, k): ([i32; 2], i32),
+    ) {
+        if row.here[0][i] <= 0.0 {
+            return;
         }
-        match self.light {
-            None => {
-                for i in 0..LANES {
-                    lambert[i] = nx[i] * ex[i] + ny[i] * ey[i] + nz[i] * ez[i];
-                }
-                gloss = lambert;
-            }
-            Some([lx, ly, lz]) => {
-                for i in 0..LANES {
-                    let (hx, hy, hz) = (lx + ex[i], ly + ey[i], lz + ez[i]);
-                    let square = hx * hx + hy * hy + hz * hz;
-                    let some = square > 1e-12;
-                    let per_half = select(some, 1.0 / select(some, square, 1.0).sqrt(), 0.0);
-                    lambert[i] = nx[i] * lx + ny[i] * ly + nz[i] * lz;
-                    gloss[i] = (nx[i] * hx + ny[i] * hy + nz[i] * hz) * per_half;
-                }
+        let h = self.thickness;
+        let z = (k as f32 - 0.5) * h;
+        let ray = self.ray(pixel);
+        let planes = [&row.before, &row.here].map(|sums| self.plane(sums.map(|sums| sums[i])));
+        let slopes = [self.along(&ray, &planes[0]), self.along(&ray, &planes[1])];
+        let mut segment = Segment { planes, slopes };
+        let [from, to] = self.end_at_faces(&mut segment, &ray, z);
+        for plane in &mut segment.planes {
+            plane.value += self.cell[0];
+        }
+        let Segment { planes: [first, last], slopes: [m0, m1] } = &segment;
+        let [low, high] = segment.bounds();
+        if (high <= scene.visible[0]) | (low >= scene.visible[1]) | (to <= from) {
+            return;
+        }
+        // How many sub-steps: by the light, and by how far value and gradient change.
+        let most = h * scene.most[scene.cell(high).0 + 1];
+        let share = (1.0 - row.a[i]) * if most < 1.0 { most } else { 1.0 };
+        let flat = self.flat * self.flat;
+        let dot = |a: &Plane, b: &Plane| {
+            let ([ax, ay, az], [bx, by, bz]) = (a.gradient, b.gradient);
+            ax * bx + ay * by + az * bz + flat
+        };
+        let cosine = dot(first, last) / (dot(first, first) * dot(last, last)).sqrt();
+        let range = (high - low) * self.range_per_cell;
+        let square = share * (STEPS[0] + STEPS[1] * (1.0 - cosine) + STEPS[2] * range);
+        let steps = match square {
+            _ if square > 16.0 => 8.0,
+            _ if square > 4.0 => 4.0,
+            _ if square > 1.0 => 2.0,
+            _ => 1.0,
+        };
+        let step = (to - from) / steps;
+        let value = |t: f32| {
+            let rise = last.value - first.value;
+            let (c, d) = (3.0 * rise - 2.0 * m0 - m1, m0 + m1 - 2.0 * rise);
+            first.value + t * (m0 + t * (c + t * d))
+        };
+        let mut light = [0.0f32; 3];
+        let mut here = value(from);
+        for j in 0..steps as u32 {
+            let begin = from + j as f32 * step;
+            let next = value(begin + step);
+            let looks = scene.between(here, next);
+            here = next;
+            let terms = shader.map(|s| self.terms(s, [first, last], begin + 0.5 * step, &ray));
+            let tau = looks[0] * h * step * row.secant[i];
+            let seen = (1.0 - row.a[i]) * opacity(tau);
+            row.a[i] += seen;
+            for c in 0..3 {
+                let lit = match terms {
+                    Some([lambert, gloss]) => looks[c + 1] * lambert + gloss,
+                    None => looks[c + 1],
+                };
+                let lit = if lit > 0.0 { lit } else { 0.0 };
+                light[c] += seen * if lit < 1.0 { lit } else { 1.0 };
             }
         }
-        shader.terms(&mut lambert, &mut gloss, LANES);
-        [lambert, gloss]
+        for c in 0..3 {
+            row.light[c][i] = fixed_light(light[c]);
+        }
+    }
+
+    /// The factor of base colours and what is added, at share `t` of a segment.
+    fn terms(&self, shader: &Shader, [first, last]: [&Plane; 2], t: f32, ray: &Ray) -> [f32; 2] {
+        let [ex, ey, ez] = ray.to_eye;
+        let [gx, gy, gz] = [0, 1, 2].map(|axis| {
+            let (from, to) = (first.gradient[axis], last.gradient[axis]);
+            from + (to - from) * t
+        });
+        let side = if gx * ex + gy * ey + gz * ez < 0.0 { -1.0 } else { 1.0 };
+        let x = gx * side + self.flat * ex;
+        let y = gy * side + self.flat * ey;
+        let z = gz * side + self.flat * ez;
+        let per_length = 1.0 / (x * x + y * y + z * z).sqrt();
+        let (nx, ny, nz) = (x * per_length, y * per_length, z * per_length);
+        let [mut lambert, mut gloss] = [[nx * ex + ny * ey + nz * ez]; 2];
+        if let Some([lx, ly, lz]) = self.light {
+            let (hx, hy, hz) = (lx + ex, ly + ey, lz + ez);
+            let square = hx * hx + hy * hy + hz * hz;
+            let per_half = if square > 1e-12 { 1.0 / square.sqrt() } else { 0.0 };
+            lambert = [nx * lx + ny * ly + nz * lz];
+            gloss = [(nx * hx + ny * hy + nz * hz) * per_half];
+        }
+        shader.terms(&mut lambert, &mut gloss, 1);
+        [lambert[0], gloss[0]]
     }
 }
 
@@ -597,102 +476,4 @@ fn inside(profile: &Profile, u: f64) -> [f32; 2] {
     }
     let share = some[0] / all[0];
     [share as f32, ((some[1] - share * all[1]) / all[0]) as f32]
-}
-
-/// The cubic with two `values` and two `slopes` (over the whole segment) at share `t`.
-#[inline(always)]
-fn hermite([a, b]: [f32; 2], [da, db]: [f32; 2], t: f32) -> f32 {
-    let rise = b - a;
-    let (c, d) = (3.0 * rise - 2.0 * da - db, da + db - 2.0 * rise);
-    a + t * (da + t * (c + t * d))
-}
-
-impl FieldScene {
-    /// Mean extinction per vox, and the mean colour by extinction, of values that go from one cell
-    /// to another. `integral` is that up to `from`, if it is known; that up to `to` afterwards.
-    #[inline(always)]
-    fn between(
-        &self,
-        simd: Simd,
-        [from, to]: [&[f32; LANES]; 2],
-        integral: &mut Option<[[f32; LANES]; 4]>,
-    ) -> [[f32; LANES]; 4] {
-        let mut middle = [0.0f32; LANES];
-        let (mut any_far, mut all_far) = (false, true);
-        for i in 0..LANES {
-            middle[i] = 0.5 * (from[i] + to[i]);
-            let far = (to[i] - from[i]).abs() >= FEW_CELLS;
-            any_far |= far;
-            all_far &= far;
-        }
-        if !any_far {
-            *integral = None;
-            return at(simd, &self.looks, &middle);
-        }
-        let p = match integral {
-            Some(integral) => *integral,
-            None => at(simd, &self.integrals, from),
-        };
-        let q = at(simd, &self.integrals, to);
-        *integral = Some(q);
-        let mut per_sum = [0.0f32; LANES];
-        let mut means = [0.0f32; LANES];
-        let mut every = all_far;
-        for i in 0..LANES {
-            let rise = to[i] - from[i];
-            let far = rise.abs() >= FEW_CELLS;
-            let sum = q[0][i] - p[0][i];
-            let some = far & (sum.abs() > 1e-6);
-            every &= some;
-            per_sum[i] = select(some, 1.0 / select(some, sum, 1.0), 0.0);
-            let mean = sum / select(far, rise, 1.0);
-            means[i] = select(mean > 0.0, mean, 0.0);
-        }
-        // Where all go far nobody looks at middles.
-        let mut out = match every {
-            true => [[0.0f32; LANES]; 4],
-            false => at(simd, &self.looks, &middle),
-        };
-        for i in 0..LANES {
-            let far = (to[i] - from[i]).abs() >= FEW_CELLS;
-            out[0][i] = select(far, means[i], out[0][i]);
-        }
-        for c in 1..4 {
-            for i in 0..LANES {
-                let mean = (q[c][i] - p[c][i]) * per_sum[i];
-                out[c][i] = select(per_sum[i] != 0.0, mean, out[c][i]);
-            }
-        }
-        out
-    }
-}
-
-/// The cells that hold values, the first or the last of those outside, and where in them.
-#[inline(always)]
-fn cells(x: &[f32; LANES]) -> ([u32; LANES], [f32; LANES]) {
-    let (mut cells, mut shares) = ([0; LANES], [0.0; LANES]);
-    for i in 0..LANES {
-        let x = select(x[i] > 0.0, x[i], 0.0);
-        let x = select(x < CELLS as f32, x, CELLS as f32);
-        let whole = truncate(x);
-        cells[i] = if whole < CELLS as u32 { whole } else { CELLS as u32 - 1 };
-        shares[i] = x - cells[i] as f32;
-    }
-    (cells, shares)
-}
-
-/// A table between its entries, channel by channel.
-#[inline(always)]
-fn at(simd: Simd, table: &[OpticalSample; CELLS + 1], x: &[f32; LANES]) -> [[f32; LANES]; 4] {
-    let (mut cells, shares) = cells(x);
-    let [mut low, mut high] = [[[0.0f32; LANES]; 4]; 2];
-    lut::take(simd, table, &cells, &mut low);
-    cells.iter_mut().for_each(|cell| *cell += 1);
-    lut::take(simd, table, &cells, &mut high);
-    for c in 0..4 {
-        for i in 0..LANES {
-            low[c][i] += (high[c][i] - low[c][i]) * shares[i];
-        }
-    }
-    low
 }

@@ -236,6 +236,7 @@ impl Floats for Eight {
         fn sub(a: __m256, b: __m256) -> __m256 { _mm256_sub_ps(a, b) }
         fn mul(a: __m256, b: __m256) -> __m256 { _mm256_mul_ps(a, b) }
         fn div(a: __m256, b: __m256) -> __m256 { _mm256_div_ps(a, b) }
+        fn sqrt(a: __m256) -> __m256 { _mm256_sqrt_ps(a) }
         fn least(a: __m256, b: __m256) -> __m256 { _mm256_min_ps(a, b) }
         fn most(a: __m256, b: __m256) -> __m256 { _mm256_max_ps(a, b) }
         fn below(a: __m256, b: __m256) -> __m256i { _mm256_castps_si256(_mm256_cmp_ps::<_CMP_LT_OQ>(a, b)) }
@@ -246,6 +247,7 @@ impl Floats for Eight {
         fn only(marks: __m256i, a: __m256) -> __m256 { _mm256_and_ps(_mm256_castsi256_ps(marks), a) }
         fn to_bits(a: __m256) -> __m256i { _mm256_castps_si256(a) }
         fn from_bits(a: __m256i) -> __m256 { _mm256_castsi256_ps(a) }
+        fn to_floats(a: __m256i) -> __m256 { _mm256_cvtepi32_ps(a) }
         fn truncated(a: __m256) -> __m256i { _mm256_cvttps_epi32(a) }
     }
 }
@@ -458,6 +460,7 @@ impl Floats for Sixteen {
         fn sub(a: __m512, b: __m512) -> __m512 { _mm512_sub_ps(a, b) }
         fn mul(a: __m512, b: __m512) -> __m512 { _mm512_mul_ps(a, b) }
         fn div(a: __m512, b: __m512) -> __m512 { _mm512_div_ps(a, b) }
+        fn sqrt(a: __m512) -> __m512 { _mm512_sqrt_ps(a) }
         fn least(a: __m512, b: __m512) -> __m512 { _mm512_min_ps(a, b) }
         fn most(a: __m512, b: __m512) -> __m512 { _mm512_max_ps(a, b) }
         fn below(a: __m512, b: __m512) -> __mmask16 { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(a, b) }
@@ -468,6 +471,7 @@ impl Floats for Sixteen {
         fn only(marks: __mmask16, a: __m512) -> __m512 { _mm512_maskz_mov_ps(marks, a) }
         fn to_bits(a: __m512) -> __m512i { _mm512_castps_si512(a) }
         fn from_bits(a: __m512i) -> __m512 { _mm512_castsi512_ps(a) }
+        fn to_floats(a: __m512i) -> __m512 { _mm512_cvtepi32_ps(a) }
         fn truncated(a: __m512) -> __m512i { _mm512_cvttps_epi32(a) }
     }
 }

@@ -1,4 +1,4 @@
-//! Where along a ray the field could be visible.
+//! Search for the parts of a ray where the field may be visible.
 //!
 //! The field is a mean of voxels, so it lies between the least and the most of those whose kernels
 //! reach. The box of voxels is cut into blocks, and each says whether any value between the two can

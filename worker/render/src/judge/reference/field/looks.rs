@@ -1,4 +1,4 @@
-//! What a value looks like: where the transfer function bends, and light.
+//! Extinction, colour and light of a value, and the values at which the transfer function bends.
 //!
 //! Between two points a transfer function is smooth. So what f could look like on a stretch is
 //! known from what was seen there and from the points between.
@@ -13,12 +13,12 @@ use slabcast_common::view::View;
 /// Extinction per vox, and that times the three colours.
 pub(super) type Emission = [f64; 4];
 
-/// What a look of extinction and colour emits.
+/// Emission of an extinction and a colour.
 pub(super) fn emission([sigma, r, g, b]: [f64; 4]) -> Emission {
     [sigma, sigma * r, sigma * g, sigma * b]
 }
 
-/// What some bends of a transfer function look like.
+/// Extinction and colour at some bends of a transfer function.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Bends {
     pub(super) least: Emission,
@@ -112,7 +112,7 @@ impl Looks {
         self.of.optics_at(code)
     }
 
-    /// What the bends between two codes look like; `None` if there are none.
+    /// Returns extinction and colour at the bends between two codes; `None` if there are none.
     pub(super) fn bends(&self, lo: f64, hi: f64) -> Option<Bends> {
         let from = self.bends.partition_point(|&b| b < lo - self.beside);
         let to = self.bends.partition_point(|&b| b <= hi + self.beside);

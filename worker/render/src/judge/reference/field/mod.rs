@@ -56,7 +56,7 @@ use slabcast_common::view::{NEAR, Projection, View};
 use std::sync::Arc;
 use sums::{Line, Near};
 
-/// Where halving ends: two levels agree to this on a panel, as a share of the opacity so far.
+/// Tolerance of halving: two levels must agree to this on a panel, as a share of the opacity so far.
 /// Against 1e-8 pixels are then off by 1e-4 to 5e-4/255 (RMSE; at most 0.005), 200 pixels of
 /// mri256 and aneurism. Ten times as much makes 1e-3/255 more (at most 0.008) for half the time;
 /// 1e-8 takes 3 to 7 times as long.
@@ -319,7 +319,7 @@ struct Stretch<'a> {
     secant: f64,
 }
 
-/// What is at a node of a panel.
+/// Field and light at a node of a panel.
 #[derive(Clone, Copy, Debug)]
 struct Node {
     /// The field.

@@ -63,7 +63,14 @@ fn truth(request: &PathRequest) -> Vec<String> {
     let wanted = BrickNeeds::for_transfer(&transfer, &info, &quality);
     let store = BrickStore::build(&volume, digest, &wanted);
     let bricks: Vec<_> = store.infos().iter().map(|i| store.brick(i.id).unwrap()).collect();
-    let spec = SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: store.key() };
+    let spec = SceneSpec {
+        id: SceneId(1),
+        volume: info,
+        transfer,
+        quality,
+        crop: None,
+        bricks: store.key(),
+    };
     let scene = Arc::new(Scene::new(&spec));
     (0..request.path.frames())
         .map(|i| {
@@ -357,7 +364,14 @@ fn truth_of_each(path: &ViewPath, default: &TransferFunction) -> Vec<String> {
         let store = BrickStore::build(&volume, info.digest, &wanted);
         let bricks: Vec<_> = store.infos().iter().map(|i| store.brick(i.id).unwrap()).collect();
         let volume = info.clone();
-        let spec = SceneSpec { id: SceneId(1), volume, transfer, quality, bricks: store.key() };
+        let spec = SceneSpec {
+            id: SceneId(1),
+            volume,
+            transfer,
+            quality,
+            crop: None,
+            bricks: store.key(),
+        };
         let view = View::new(&info.lattice, &cameras.camera(i).unwrap(), path.size, &quality);
         let frame = Frame::new(Arc::new(Scene::new(&spec)), view.unwrap());
         serial::render(&frame, &bricks).sha256().to_string()

@@ -33,6 +33,7 @@
 pub mod blocks;
 pub mod bounds;
 pub mod brick;
+pub mod crop;
 pub mod gradient;
 pub mod ids;
 pub mod image;

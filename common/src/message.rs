@@ -5,6 +5,7 @@
 //! them on a path of their own ([`BrickBatch`]), so that control never queues behind data.
 
 use crate::brick::{Brick, BrickGrid, BrickInfo, BrickSetKey};
+use crate::crop::CropBox;
 use crate::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use crate::image::{PixelEncoding, SparseTile, TilePixels, TileState};
 use crate::occlusion::Rect;
@@ -28,6 +29,8 @@ pub struct SceneSpec {
     pub transfer: TransferFunction,
     /// Quality; `sums` is decided (never [`Sums::Auto`](crate::quality::Sums::Auto)).
     pub quality: Quality,
+    /// Box outside of which nothing is drawn; `None` for the whole volume.
+    pub crop: Option<CropBox>,
     /// Key of the brick set from which the scene is drawn.
     pub bricks: BrickSetKey,
 }

@@ -259,6 +259,10 @@ pub struct Classifier {
     uncapped: bool,
     /// Factor of the opacity by code of the gradient magnitude; empty if unmodulated.
     factors: Vec<f64>,
+    /// Points of the opacity by gradient; empty if unmodulated.
+    gradient_points: Vec<[f64; 2]>,
+    /// The points' unit of gradients, for a change by the values' range per vox.
+    gradient_per_share: f64,
 }
 
 /// Returns the value at `x` of the piecewise linear function through `points`, of which there is at
@@ -329,17 +333,19 @@ impl Classifier {
             summary,
             payload_max: rule.payload(largest),
             uncapped: rule.sigma(largest) > SIGMA_MAX && compositing != Compositing::Paper,
+            gradient_points: Vec::new(),
+            gradient_per_share: 1.0,
             factors: Vec::new(),
         };
         if !tf.gradient_opacity.is_empty() {
             let (lo, hi) = info.summary.range();
-            let one = match tf.domain {
+            let per_share = match tf.domain {
                 Domain::Unit => 1.0,
                 Domain::Value => (hi - lo) / info.lattice.vox(),
             };
-            let factor =
-                |code: u8| interpolate(&tf.gradient_opacity, decode_magnitude(code) * one)[1];
-            c.factors = (0..=255).map(factor).collect();
+            c.gradient_points.clone_from(&tf.gradient_opacity);
+            c.gradient_per_share = per_share;
+            c.factors = (0..=255).map(|code| c.gradient_factor(decode_magnitude(code))).collect();
         }
         c.table = (0..codes).map(|code| c.evaluate(code as f64)).collect();
         c
@@ -419,6 +425,22 @@ impl Classifier {
         OpticalSample { sigma: self.rule.payload(a * factor) as f32, ..look }
     }
 
+    /// Returns the factor of opacities where the value changes by `share` of its range per vox; 1 if
+    /// the transfer function does not depend on gradients.
+    pub fn gradient_factor(&self, share: f64) -> f64 {
+        match &self.gradient_points[..] {
+            [] => 1.0,
+            points => interpolate(points, share * self.gradient_per_share)[1],
+        }
+    }
+
+    /// Returns the steepest gradient that the transfer function has a point for, as a share of the
+    /// values' range per vox; `None` if it does not depend on gradients.
+    pub fn steepest_gradient(&self) -> Option<f64> {
+        let last = self.gradient_points.last()?[0] / self.gradient_per_share;
+        Some(if last.is_finite() { last } else { 0.0 })
+    }
+
     /// Returns whether gradients modulate opacities. A code alone does not determine the optical
     /// sample then.
     pub fn is_modulated(&self) -> bool {
@@ -490,19 +512,12 @@ impl Classifier {
     /// of their thickness.
     ///
     /// # Errors
-    /// If integers are requested that can't hold the extinction, or opacity by gradient together
-    /// with classification after reconstruction.
+    /// If integers are requested that can't hold the extinction.
     pub fn choose_sums(&self, quality: &Quality, lattice: &Lattice) -> Result<Sums, InvalidField> {
         let d = quality.thickness;
         let enough = (2.0 * 255.0 * quality.eps).min(3.0) * (d * d).min(1.0);
         let depth = lattice.diagonal() / lattice.vox();
         if quality.classify == Classify::After {
-            if self.is_modulated() {
-                return Err(InvalidField::new(
-                    "gradient_opacity",
-                    "is not drawn with `--classify after` yet; use `--classify before`",
-                ));
-            }
             // Sums hold values: 16 bits round them by some 1/4000 of all codes.
             let support = self.support();
             let visible = match (support.intervals.first(), support.intervals.last()) {

@@ -18,7 +18,6 @@ use slabcast_common::quality::{Classify, Quality, Sums};
 use slabcast_common::stats::{BrickStats, ErrorStats, FrameStats, LeftOut};
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::Digest32;
-use slabcast_scene::path::CropBox;
 use slabcast_scene::request::PathRequest;
 use slabcast_schedule::{Span, Spans};
 use slabcast_volumes::BrickStore;
@@ -83,7 +82,6 @@ pub(crate) struct FrameSums {
     pub(crate) frame: FrameId,
     pub(crate) request: Arc<PathRequest>,
     pub(crate) scene: Arc<SceneSpec>,
-    pub(crate) crop: Option<CropBox>,
     pub(crate) view: View,
     pub(crate) state: Box<FrameState>,
     /// The picture of tiles that came finished, if any did.
@@ -101,7 +99,7 @@ pub(crate) struct FrameSums {
 /// `Quality::cull` and `Quality::grey` change no pixel and are left out.
 ///
 /// [`PIXELS_VERSION`]: slabcast_common::PIXELS_VERSION
-pub fn view_sha256(scene: &SceneSpec, crop: Option<&CropBox>, view: &View) -> Digest32 {
+pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
     let mut h = Sha256::new();
     h.update(b"slabcast view 1");
     h.update(slabcast_common::PIXELS_VERSION.to_le_bytes());
@@ -130,7 +128,7 @@ pub fn view_sha256(scene: &SceneSpec, crop: Option<&CropBox>, view: &View) -> Di
     for x in numbers {
         h.update(x.to_le_bytes());
     }
-    for x in crop.into_iter().flat_map(|c| c.lo.to_array().into_iter().chain(c.hi.to_array())) {
+    for x in scene.crop.iter().flat_map(|c| c.lo.to_array().into_iter().chain(c.hi.to_array())) {
         h.update(x.to_le_bytes());
     }
     Digest32(h.finalize().into())
@@ -239,7 +237,7 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     if let Some(path) = &mut stats.critical_path {
         *path = format!("frame {}: {path}", stats.frame);
     }
-    stats.view_sha256 = view_sha256(&s.scene, s.crop.as_ref(), &s.view).to_string();
+    stats.view_sha256 = view_sha256(&s.scene, &s.view).to_string();
     stats.pixels_sha256 = sha256.map_or_else(String::new, |hash| hash.to_string());
     if s.rehearsed {
         stats.rehearsed = true;

@@ -5,6 +5,8 @@
 //! pixel of the picture, to the bit. Each line has the transmittance of f64 sheets for comparison,
 //! and below all lines stands the limit.
 
+mod field;
+
 use crate::ablation;
 use crate::single_frame::SingleFrame;
 use slabcast_common::quality::Classify;
@@ -30,6 +32,10 @@ use std::fmt::Write;
 /// how many bricks it is made of, the strongest first. All other numbers are the renderer's own, in
 /// its arithmetic: they lead to the pixel of the picture to the bit. Below stand the pixel, the
 /// pixel of f64 sheets, and the limit of infinitely thin sheets.
+///
+/// With `--classify after` each line is a plane of the reconstructed field: its value there, the
+/// value in f64, the length of the gradient per vox, and optical depth and colour of the segment of
+/// the ray between the plane before and this one.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_long_help = "\
 Examples:
@@ -51,7 +57,9 @@ voxels, bricks, hidden: {voxels, bricks}, sheets: [{k, depth: [from, to], tau, c
 raw, peek, sections, bricks, reference: {tau, colour, t}, voxels: [{voxel, brick, value, weights,
 tau, colour}]}]}. rgba, same_thickness and limit are linear, premultiplied; errors are the largest
 of four channels in 1/255; t is what is let through by this sheet and all in front of it; shut_in is
-null where the pixel stays open; reference is null where f64 sheets have nothing there.")]
+null where the pixel stays open; reference is null where f64 sheets have nothing there.
+With --classify after: planes in place of sheets, [{k, depth, value, reference, gradient, tau, colour, t,
+count, bricks, voxels: [{voxel, brick, value, adds}]}].")]
 pub struct ExplainArgs {
     #[command(flatten)]
     of: VolumeSceneArgs,
@@ -82,6 +90,14 @@ struct ExplainedPixel {
     values: ValueMap,
 }
 
+/// The explanation of a pixel, by the order of classification.
+enum Explained {
+    /// Sheets of voxels that are classified before reconstruction.
+    Sheets(ExplainedPixel),
+    /// Planes of a field.
+    Field(field::ExplainedField),
+}
+
 /// Runs `slabcast lab explain`: prints a table, or JSON with `--json`.
 ///
 /// # Errors
@@ -98,10 +114,15 @@ pub fn run(args: &ExplainArgs) -> Result<(), Fail> {
         let args = args.clone();
         signals::run_unless_stopped(move || explain_pixel(&args, pixel))?
     };
-    say(&if args.json { json(&found) } else { text(&found) })
+    say(&match (&found, args.json) {
+        (Explained::Sheets(found), false) => text(found),
+        (Explained::Sheets(found), true) => json(found),
+        (Explained::Field(found), false) => field::text(found),
+        (Explained::Field(found), true) => field::json(found),
+    })
 }
 
-fn explain_pixel(args: &ExplainArgs, pixel: [u32; 2]) -> Result<ExplainedPixel, Fail> {
+fn explain_pixel(args: &ExplainArgs, pixel: [u32; 2]) -> Result<Explained, Fail> {
     // `request` refuses targets, since a magnified pixel has no sheets of its own.
     args.of.scene.request(Default::default())?;
     let scene = SingleFrame::read(&args.of, 1, |[w, h]| {
@@ -120,15 +141,12 @@ fn explain_pixel(args: &ExplainArgs, pixel: [u32; 2]) -> Result<ExplainedPixel, 
     let [x, y] = pixel;
     let quality = scene.spec.quality;
     if quality.classify == Classify::After {
-        return Err(Fail::usage(
-            "--classify: explain shows sheets of voxels that are classified before they are \
-             splatted; use `--classify before`",
-        ));
+        return Ok(Explained::Field(field::explained(&scene, pixel, args.voxels)));
     }
     let explained = explain(&scene.frame(quality), &scene.bricks, pixel, args.voxels);
     let reference = scene.reference();
     let sheets = reference.sheet_by_sheet(x, y, SheetOptions::default());
-    Ok(ExplainedPixel {
+    Ok(Explained::Sheets(ExplainedPixel {
         pixel,
         size: scene.view.size,
         thickness: quality.thickness,
@@ -138,7 +156,7 @@ fn explain_pixel(args: &ExplainArgs, pixel: [u32; 2]) -> Result<ExplainedPixel, 
         sheets: sheets.into_iter().map(|s| (s.k, s)).collect(),
         values: scene.spec.volume.summary.map,
         explained,
-    })
+    }))
 }
 
 /// Returns the largest difference of four channels, in 1/255.
@@ -181,16 +199,22 @@ fn text(found: &ExplainedPixel) -> String {
         None => {}
     }
     let _ = writeln!(out, "in all {} voxels; bricks: {}\n", e.voxels, e.bricks);
+    let others = [("sheets in f64", found.same_thickness), ("limit", found.limit)];
+    put_pixels(&mut out, e.pixel, &others);
+    out
+}
+
+/// Appends a pixel and others that it is compared with, with their differences.
+fn put_pixels(out: &mut String, pixel: [f32; 4], others: &[(&str, [f64; 4])]) {
     let row = |name: &str, p: [f64; 4], what: String| {
         let [r, g, b, a] = p.map(|x| format!("{x:.6}"));
         format!("{name:<15} {r}  {g}  {b}  {a}   {what}\n")
     };
     out.push_str("linear, premultiplied   R         G         B         A   off by, 1/255\n");
-    out += &row("pixel", e.pixel.map(f64::from), String::new());
-    let same = found.same_thickness;
-    out += &row("sheets in f64", same, number(largest_error(e.pixel, same)));
-    out += &row("limit", found.limit, number(largest_error(e.pixel, found.limit)));
-    out
+    *out += &row("pixel", pixel.map(f64::from), String::new());
+    for (name, other) in others {
+        *out += &row(name, *other, number(largest_error(pixel, *other)));
+    }
 }
 
 fn put_sheet(out: &mut String, found: &ExplainedPixel, s: &SheetAtPixel) {

@@ -64,6 +64,7 @@ impl SceneBricks {
             volume: info.clone(),
             transfer: transfer.clone(),
             quality: Quality { sums, ..quality },
+            crop: wanted.crop,
             bricks: store.key(),
         };
         Ok(SceneBricks { spec, bricks })

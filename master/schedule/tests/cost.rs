@@ -51,8 +51,14 @@ fn cost(n: u32, edge: u32, height: f64, workers: u64, work: Work) -> f64 {
         })
         .collect();
     let set = BrickSetKey(Digest32([2; 32]));
-    let scene =
-        Arc::new(SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: set });
+    let scene = Arc::new(SceneSpec {
+        id: SceneId(1),
+        volume: info,
+        transfer,
+        quality,
+        crop: None,
+        bricks: set,
+    });
     let count = bricks.len();
     let job = FrameJob { frame: FrameId(1), number: 0, scene, bricks, view, work, finish: None };
 

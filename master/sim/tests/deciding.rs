@@ -40,7 +40,8 @@ fn ball(frames: usize) -> (Vec<FrameJob>, Trace) {
         })
         .collect();
     let set = BrickSetKey(Digest32([2; 32]));
-    let scene = SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: set };
+    let scene =
+        SceneSpec { id: SceneId(1), volume: info, transfer, quality, crop: None, bricks: set };
     let scene = Arc::new(scene);
     let finish =
         PixelEncoding { format: PixelFormat::Rgb8, background: Background::Colour([0.0; 3]) };

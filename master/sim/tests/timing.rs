@@ -41,7 +41,8 @@ fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
         })
         .collect();
     let set = BrickSetKey(Digest32([2; 32]));
-    let scene = SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: set };
+    let scene =
+        SceneSpec { id: SceneId(1), volume: info, transfer, quality, crop: None, bricks: set };
     let scene = Arc::new(scene);
     let jobs: Vec<FrameJob> = (0..frames)
         .map(|i| {

@@ -101,7 +101,6 @@ impl Driver {
             frame,
             request: job.request.clone(),
             scene: flight.scene.clone(),
-            crop: job.wanted.crop,
             view: job.views[flight.number as usize],
             state,
             assembly: flight.assembly.clone(),

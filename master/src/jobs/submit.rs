@@ -148,7 +148,8 @@ impl Plan {
         store: Option<Arc<BrickStore>>,
     ) -> ActiveJob {
         let Plan { request, wanted, transfer, quality, tween, views, framing: _ } = self;
-        let scene = SceneSpec { id: SceneId(id.0), volume, transfer, quality, bricks };
+        let crop = wanted.crop;
+        let scene = SceneSpec { id: SceneId(id.0), volume, transfer, quality, crop, bricks };
         ActiveJob { request, scene: Arc::new(scene), tween, wanted, views, store, next: 0 }
     }
 

@@ -58,6 +58,7 @@ mod tests {
             transfer: presets::by_name("peer-semi", &volume.summary).unwrap(),
             volume: volume.info(Digest32([7; 32])),
             quality: Quality { sums: Sums::I32, ..Quality::default() },
+            crop: None,
             bricks: BrickSetKey(Digest32([9; 32])),
         };
         let new = convert::scene_to_wire(&spec);

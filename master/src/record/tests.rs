@@ -84,6 +84,7 @@ fn jobs(rng: &mut Rng, schedule: Schedule) -> Vec<FrameJob> {
         volume: info.clone(),
         transfer,
         quality,
+        crop: None,
         bricks: set,
     });
     let path = ViewPath::from_turntable([96, 80], Turntable { frames: 3, ..Turntable::default() });

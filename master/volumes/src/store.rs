@@ -176,7 +176,9 @@ fn cut<T: Copy + Into<f64> + Sync>(
 ) -> Vec<(BrickInfo, Mutex<Content>)> {
     let field = Codes { codes, dims: volume.lattice.dims };
     let near = (needs.halo > 0).then(|| {
-        let inside = |voxel| needs.crop.is_none_or(|c| c.contains(&volume.lattice, voxel));
+        // A voxel shows within one step of it: those beside the box count.
+        let beside = needs.crop.map(|crop| crop.grown(&volume.lattice, 1.0));
+        let inside = |voxel| beside.is_none_or(|c| c.contains(&volume.lattice, voxel));
         let visible = |voxel, offset: usize| relevant(codes[offset]) && inside(voxel);
         VoxelMask::new(field.dims, visible).dilated(needs.halo)
     });
@@ -191,16 +193,9 @@ fn cut<T: Copy + Into<f64> + Sync>(
             found.clear();
             let corner = [x, y, z].map(|n| n * BRICK_EDGE);
             match &near {
-                Some(near) => {
-                    let inside = |voxel| {
-                        near.get(voxel)
-                            && needs.crop.is_none_or(|c| c.contains(&volume.lattice, voxel))
-                    };
-                    field.collect(corner, &|_| true, &inside, &mut found);
-                }
+                Some(near) => field.collect(corner, &|_| true, &|v| near.get(v), &mut found),
                 None => {
-                    let inside =
-                        |voxel| needs.crop.is_none_or(|c| c.contains(&volume.lattice, voxel));
+                    let inside = |v| needs.crop.is_none_or(|c| c.contains(&volume.lattice, v));
                     field.collect(corner, &relevant, &inside, &mut found);
                 }
             }

@@ -4,6 +4,7 @@ use glam::{DMat3, DVec3};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use slabcast_common::brick::BrickSetKey;
+use slabcast_common::crop::CropBox;
 use slabcast_common::ids::{BrickId, SceneId};
 use slabcast_common::kernel::Lean;
 use slabcast_common::message::SceneSpec;
@@ -190,14 +191,23 @@ pub fn quality(sums: impl Strategy<Value = Sums>) -> impl Strategy<Value = Quali
     )
 }
 
+fn crop() -> impl Strategy<Value = Option<CropBox>> {
+    let ends = prop_oneof![Just((f64::NEG_INFINITY, f64::INFINITY)), (-9.0..0.0, 0.5..9.0)];
+    proptest::option::of([ends.clone(), ends.clone(), ends].prop_map(|[x, y, z]| CropBox {
+        lo: glam::DVec3::new(x.0, y.0, z.0),
+        hi: glam::DVec3::new(x.1, y.1, z.1),
+    }))
+}
+
 pub fn scene() -> impl Strategy<Value = SceneSpec> {
     let sums = prop_oneof![Just(Sums::I32), Just(Sums::F32)];
-    (any::<u64>(), info(), transfer(), quality(sums), key()).prop_map(
-        |(id, volume, transfer, quality, bricks)| SceneSpec {
+    (any::<u64>(), info(), transfer(), quality(sums), crop(), key()).prop_map(
+        |(id, volume, transfer, quality, crop, bricks)| SceneSpec {
             id: SceneId(id),
             volume,
             transfer,
             quality,
+            crop,
             bricks,
         },
     )

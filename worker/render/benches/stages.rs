@@ -99,6 +99,7 @@ impl How {
             volume: volume.info(Digest32::default()),
             transfer,
             quality: self.quality,
+            crop: None,
             bricks: Default::default(),
         };
         let projection = if self.perspective {

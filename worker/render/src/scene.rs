@@ -254,10 +254,10 @@ impl Frame {
             let v = view.offset_in_eye(local_position(i)).to_array();
             offsets.iter_mut().zip(v).for_each(|(offsets, v)| offsets[usize::from(i)] = v);
         }
-        let field = scene.field.as_ref().map(|field| {
-            let (shader, dims) = (scene.shader.as_ref(), scene.dims);
-            FieldRule::new(field, shader, q, &view, spread, dims).into()
-        });
+        let field = scene
+            .field
+            .as_ref()
+            .map(|field| FieldRule::new(field, scene.shader.as_ref(), q, &view, spread).into());
         Frame {
             field,
             flat,

@@ -50,6 +50,7 @@ pub fn spec(volume: &Volume, quality: Quality) -> SceneSpec {
         volume: volume.info(Digest32::default()),
         transfer: vessels(),
         quality,
+        crop: None,
         bricks: Default::default(),
     }
 }

@@ -145,6 +145,7 @@ fn second_turntable_allocates_nothing_while_drawing() {
             volume: volume.info(Digest32::default()),
             transfer: transfer(unit),
             quality,
+            crop: None,
             bricks: Default::default(),
         };
         let scene = Arc::new(Scene::new(&spec));

@@ -70,7 +70,7 @@ impl World {
         let view = View::new(&volume.lattice, &camera, [32, 32], &quality).unwrap();
         let id = SceneId(3);
         let volume = volume.info(Digest32::default());
-        let spec = SceneSpec { id, volume, transfer, quality, bricks: SET };
+        let spec = SceneSpec { id, volume, transfer, quality, crop: None, bricks: SET };
         let (worker, heartbeat_ms) = (WorkerId(1), 60_000);
         let protocol_version = slabcast_common::PROTOCOL_VERSION;
         world.say(ToWorker::Welcome { worker, heartbeat_ms, protocol_version });

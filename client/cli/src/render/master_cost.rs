@@ -81,7 +81,7 @@ async fn plain(
     let draw = std::thread::spawn(move || {
         for i in 0..frames {
             let frame = stage.frame(i).expect("a frame");
-            let view = view_sha256(&stage.spec(i), None, &frame.view);
+            let view = view_sha256(&stage.spec(i), &frame.view);
             let cut = Cut { tile: 64, ..Cut::on(threads) };
             let picture = slabcast_session::direct::draw(&frame, &stage.bricks, cut);
             if drawn.send((picture, view)).is_err() {

@@ -14,7 +14,6 @@ use debug_views::DebugView;
 use quality::{choose_here, choose_there};
 use run::Run;
 use slabcast_client::{Client, VolumeDescription};
-use slabcast_common::quality::Classify;
 use slabcast_common::volume::Volume;
 use slabcast_scene::path::Orientation;
 use slabcast_session::embedded::{self, Cluster, WorkerGroup};
@@ -308,13 +307,6 @@ fn showable(
     }
     if show == DebugView::Owner {
         return Ok(());
-    }
-    if request.quality.classify == Classify::After {
-        return Err(Fail::usage(format!(
-            "--classify: --show {} shows voxels that are classified before they are splatted; use \
-             `--classify before`",
-            show.stem()
-        )));
     }
     for (given, flag) in [
         (args.master.is_some(), "master"),

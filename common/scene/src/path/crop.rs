@@ -6,6 +6,7 @@
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+pub use slabcast_common::crop::CropBox;
 use slabcast_common::quality::InvalidField;
 use slabcast_common::volume::Lattice;
 
@@ -86,27 +87,6 @@ impl Crop {
             }
         }
         Ok(CropBox { lo: ends[0], hi: ends[1] })
-    }
-}
-
-/// A cropping box of one lattice. Ends are relative to the centre of the volume, in world units.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct CropBox {
-    /// Lower ends along the world's axes, in world units from the volume's centre; -inf where
-    /// nothing is cropped.
-    pub lo: DVec3,
-    /// Upper ends along the world's axes, in world units from the volume's centre; inf where
-    /// nothing is cropped.
-    pub hi: DVec3,
-}
-
-impl CropBox {
-    /// Returns whether the sample at index position `at` is inside, ends included.
-    #[inline]
-    pub fn contains(&self, lattice: &Lattice, at: [u32; 3]) -> bool {
-        let from_centre = DVec3::from_array(at.map(f64::from)) - lattice.centre_index();
-        let p = lattice.world_from_index() * from_centre;
-        p.cmpge(self.lo).all() && p.cmple(self.hi).all()
     }
 }
 

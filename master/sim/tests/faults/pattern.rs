@@ -50,7 +50,14 @@ pub(crate) fn scene(id: u64, set: BrickSetKey, dims: [u32; 3], quality: Quality)
     let volume = Volume::from_fn_u8("fake", dims, |i, j, k| (i + j + k) as u8);
     let info = volume.info(Digest32([7; 32]));
     let transfer = presets::by_name("grey", &info.summary).expect("a known name");
-    Arc::new(SceneSpec { id: SceneId(id), volume: info, transfer, quality, bricks: set })
+    Arc::new(SceneSpec {
+        id: SceneId(id),
+        volume: info,
+        transfer,
+        quality,
+        crop: None,
+        bricks: set,
+    })
 }
 
 pub(crate) fn view(rng: &mut Rng, scene: &SceneSpec, size: [u32; 2]) -> View {

@@ -11,7 +11,9 @@ use crate::convert::numbers::{
     triple_from_wire, vector_from_wire,
 };
 use bytes::Bytes;
+use glam::DVec3;
 use slabcast_common::brick::BrickSetKey;
+use slabcast_common::crop::CropBox;
 use slabcast_common::ids::{FrameId, SceneId};
 use slabcast_common::image::PixelEncoding;
 use slabcast_common::kernel::Lean;
@@ -69,8 +71,23 @@ pub fn scene_to_wire(scene: &SceneSpec) -> wire::Scene {
         volume: Some(volume_to_wire(&scene.volume)),
         transfer: Some(transfer_to_wire(&scene.transfer)),
         quality: Some(quality_to_wire(&scene.quality)),
+        crop: scene.crop.iter().flat_map(|c| [c.lo, c.hi]).flat_map(|v| v.to_array()).collect(),
         set: Bytes::copy_from_slice(&scene.bricks.0.0),
     }
+}
+
+fn crop_from_wire(ends: &[f64]) -> Result<Option<CropBox>, WireError> {
+    if ends.is_empty() {
+        return Ok(None);
+    }
+    let Ok([x0, y0, z0, x1, y1, z1]) = <[f64; 6]>::try_from(ends) else {
+        return Err(WireError::length("crop", ends.len(), 6));
+    };
+    let crop = CropBox { lo: DVec3::new(x0, y0, z0), hi: DVec3::new(x1, y1, z1) };
+    if !crop.lo.cmplt(crop.hi).all() {
+        return Err(WireError::value("crop", "has an upper end that is not above the lower one"));
+    }
+    Ok(Some(crop))
 }
 
 /// Converts a scene from its message on the wire.
@@ -88,7 +105,8 @@ pub fn scene_from_wire(scene: wire::Scene) -> Result<SceneSpec, WireError> {
         return Err(WireError::value("quality.sums", "is undecided; a scene says which sums"));
     }
     let bricks = BrickSetKey(digest_from_wire("set", &scene.set)?);
-    Ok(SceneSpec { id: SceneId(scene.scene), volume, transfer, quality, bricks })
+    let crop = crop_from_wire(&scene.crop)?;
+    Ok(SceneSpec { id: SceneId(scene.scene), volume, transfer, quality, crop, bricks })
 }
 
 /// Writes a frame; results are `uncompressed` or not.

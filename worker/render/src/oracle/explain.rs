@@ -330,7 +330,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
 }
 
 /// Makes a pixel of opacity and fixed-point light, as the end of a frame does.
-fn finish(a: f32, colour: [u32; 3]) -> [f32; 4] {
+pub(super) fn finish(a: f32, colour: [u32; 3]) -> [f32; 4] {
     let mut state = FrameState::new([1, 1]);
     let pixels = TilePixels { a: vec![a], colour: vec![colour], last: None };
     state.add_slab_tile(Rect::new(0, 0, 1, 1), &pixels);

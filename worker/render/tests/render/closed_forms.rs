@@ -37,6 +37,7 @@ fn picture(
         volume: volume.info(Digest32::default()),
         transfer: tf,
         quality,
+        crop: None,
         bricks: Default::default(),
     };
     let n = 4 * (volume.lattice.dims[0].max(volume.lattice.dims[2]) + 8);

@@ -4,12 +4,14 @@ use crate::support::{bricks_of, transfer};
 use glam::DVec3;
 use slabcast_common::ids::SceneId;
 use slabcast_common::message::SceneSpec;
-use slabcast_common::quality::{Compositing, Quality, Sums};
+use slabcast_common::quality::{Classify, Compositing, Kernel, Quality, Sums};
 use slabcast_common::shade::Shading;
 use slabcast_common::transfer::{OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
+use slabcast_render::judge::reference::FieldReference;
 use slabcast_render::oracle::explain::{PixelExplanation, explain};
+use slabcast_render::oracle::explain_field::explain_field;
 use slabcast_render::oracle::serial;
 use slabcast_render::oracle::work_counters::count_work;
 use slabcast_render::{Frame, Scene};
@@ -36,14 +38,19 @@ fn lit() -> TransferFunction {
     TransferFunction { shading: Shading::default(), ..unlit }
 }
 
-fn frame(volume: &Volume, quality: Quality, projection: CameraProjection) -> Frame {
-    let spec = SceneSpec {
+fn spec(volume: &Volume, quality: Quality) -> SceneSpec {
+    SceneSpec {
         id: SceneId(1),
         volume: volume.info(Digest32::default()),
         transfer: lit(),
         quality,
+        crop: None,
         bricks: Default::default(),
-    };
+    }
+}
+
+fn frame(volume: &Volume, quality: Quality, projection: CameraProjection) -> Frame {
+    let spec = spec(volume, quality);
     let camera = Camera {
         to_eye: DVec3::new(0.53, 0.71, 0.36),
         up: DVec3::Z,
@@ -97,6 +104,56 @@ fn explained_pixel_equals_rendered_pixel_bit_for_bit() {
                 shut += usize::from(e.shut_in.is_some());
             }
             assert!(seen > 10 && (shut > 3) == (quality.eps > 0.0), "{seen} seen, {shut} shut");
+        }
+    }
+}
+
+/// A field's pixel is explained with the renderer's numbers, and with values near the exact ones.
+#[test]
+fn explained_field_equals_rendered_pixel_bit_for_bit() {
+    let volume = onion();
+    let bricks = bricks_of(&volume);
+    for (sums, thickness) in [(Sums::I32, 0.5), (Sums::I16, 1.0)] {
+        for projection in PROJECTIONS {
+            let quality = Quality {
+                classify: Classify::After,
+                kernel: Kernel::Bspline,
+                sums,
+                thickness,
+                ..Quality::default()
+            };
+            let frame = frame(&volume, quality, projection);
+            let (picture, notes) = count_work(&frame, &bricks);
+            let reference = FieldReference::new(&spec(&volume, quality), frame.view, &bricks);
+            let (mut seen, mut shut, mut deep) = (0, 0, 0);
+            for [x, y] in places() {
+                let e = explain_field(&frame, &bricks, [x, y], 3);
+                let i = (y * SIZE + x) as usize;
+                let what = format!("{sums:?} {projection:?} {x},{y}");
+                assert_eq!(
+                    e.pixel.map(f32::to_bits),
+                    picture.pixels[i].map(f32::to_bits),
+                    "{what}"
+                );
+                assert_eq!(
+                    (notes.shut_in[i], notes.sheets[i] as usize),
+                    (e.shut_in, e.planes.len())
+                );
+                for plane in &e.planes {
+                    let exact = reference.value_on_ray([x, y], plane.depth);
+                    // Outside the box a kernel's weight is small, and what is divided by it coarse.
+                    if plane.voxels > 40 {
+                        deep += 1;
+                        assert!((plane.code - exact).abs() < 1.5, "{what}: {plane:?}, {exact}");
+                    }
+                    assert!(plane.strongest.len() == plane.voxels.min(3), "{what}");
+                    let terms: f64 = plane.strongest.iter().map(|v| v.adds).sum();
+                    assert!(terms <= plane.code.abs() + 1.0 || plane.voxels < 40, "{what}");
+                }
+                seen += usize::from(e.pixel[3] > 0.0);
+                shut += usize::from(e.shut_in.is_some());
+            }
+            assert!(seen > 10 && shut > 3 && deep > 20, "{seen} seen, {shut} shut, {deep} deep");
         }
     }
 }

@@ -56,6 +56,7 @@ impl Shot {
             volume: info,
             transfer,
             quality,
+            crop: None,
             bricks: Default::default(),
         };
         Shot { volume, spec, view }

@@ -7,6 +7,7 @@ use crate::support::{bricks_of, infos_of, transfer};
 use glam::DVec3;
 use proptest::prelude::*;
 use slabcast_common::brick::Brick;
+use slabcast_common::crop::CropBox;
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::{FrameState, Picture};
 use slabcast_common::message::{Counters, SceneSpec};
@@ -249,12 +250,21 @@ proptest! {
         if seed & 1 == 0 {
             look.colors = look.colors.iter().map(|c| [c[0], c[1], c[1], c[1]]).collect();
         }
+        if after && seed & 12 == 0 {
+            look.gradient_opacity = vec![[0.0, 0.1], [0.05, 0.7], [0.2, 1.0]];
+        }
+        // The bricks hold all voxels; `before` cuts them to the box.
+        let crop = (after && seed & 6 == 0).then(|| CropBox {
+            lo: DVec3::new(-2.3, f64::NEG_INFINITY, -3.1),
+            hi: DVec3::new(f64::INFINITY, 2.7, 1.9),
+        });
         let make = |cull| {
             let spec = SceneSpec {
                 id: SceneId(1),
                 volume: v.info(Digest32::default()),
                 transfer: look.clone(),
                 quality: Quality { cull, ..quality },
+                crop,
                 bricks: Default::default(),
             };
             Frame::new(Arc::new(Scene::new(&spec)), view)
@@ -321,6 +331,7 @@ fn nan_infinite_and_huge_samples_give_finite_pixels() {
         volume: v.info(Digest32::default()),
         transfer: tf,
         quality,
+        crop: None,
         bricks: Default::default(),
     };
     let camera = Camera {

@@ -46,6 +46,7 @@ impl JudgedScene {
             volume: volume.info(Digest32::default()),
             transfer: tf,
             quality,
+            crop: None,
             bricks: Default::default(),
         };
         let view = View::new(&volume.lattice, &camera, [n, n], &quality).unwrap();

@@ -26,7 +26,6 @@ use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::shade::Shader;
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::SampleKind;
-use tables::CELLS;
 
 /// Terms of the number of sub-steps m, `m^2 >= a (K0 + K1 (1 - c) + K2 r)` for the light `a` that a
 /// segment can add, the cosine `c` between its gradients, and the range `r` of its values in 1/255
@@ -45,15 +44,31 @@ const LEAST_WEIGHT: f32 = 0.25;
 const FACE_STEPS: usize = 32;
 
 /// Two parallel planes between which the field is drawn: the faces of the volume along an index
-/// axis.
+/// axis, in lattice steps, or of the cropping box along a world axis, in world units.
 #[derive(Clone, Copy, Debug)]
 struct Faces {
-    /// Coordinate along the axis: `along . eye + from`, in lattice steps.
+    /// Coordinate along the axis: `along . eye + from`.
     along: [f32; 3],
     from: f32,
     /// Coordinates of the faces.
     lo: f32,
     hi: f32,
+}
+
+impl Faces {
+    /// Coordinate of a ray at depth `z`.
+    #[inline(always)]
+    fn at(&self, ray: &Ray, z: f32) -> f32 {
+        let [ex, ey] = [ray.at[0] + ray.slope[0] * z, ray.at[1] + ray.slope[1] * z];
+        let [x, y, d] = self.along;
+        x * ex + y * ey + d * z + self.from
+    }
+
+    /// Distance of coordinate `q` from the nearer face, negative outside.
+    #[inline(always)]
+    fn depth(&self, q: f32) -> f32 {
+        (q - self.lo).min(self.hi - q)
+    }
 }
 
 /// Compositing rule for the planes of a field, with the constants of one view.
@@ -76,6 +91,8 @@ pub struct FieldRule {
     range_per_cell: f32,
     thickness: f32,
     faces: [Faces; 3],
+    /// Faces of the cropping box, along the axes that it crops.
+    crop: Vec<Faces>,
     /// Weight of a kernel on one side of a face by distance, and its slope per lattice step.
     face: Box<[[f32; 2]]>,
     /// Distance from a face beyond which the weight is one, in lattice steps.
@@ -126,9 +143,8 @@ impl FieldRule {
         quality: &Quality,
         view: &View,
         spread: DVec3,
-        dims: [u32; 3],
     ) -> FieldRule {
-        let cells = CELLS as f64 / (scene.hull[1] - scene.hull[0]);
+        let cells = scene.cells_per_code();
         let sign = if scene.background > scene.range[0] { -1.0 } else { 1.0 };
         // Raw units of a sum for one code: 2^15 and 2^30 with some room for the kernel's ripple.
         let short = quality.sums == Sums::I16;
@@ -156,7 +172,16 @@ impl FieldRule {
                 along: along.to_array().map(|x| x as f32),
                 from: -along.dot(view.eye_origin) as f32,
                 lo: -0.5,
-                hi: (f64::from(dims[axis]) - 0.5) as f32,
+                hi: (f64::from(scene.dims[axis]) - 0.5) as f32,
+            }
+        });
+        let crop = scene.crop.iter().map(|crop| {
+            let along = index_from_eye.transpose() * crop.along;
+            Faces {
+                along: along.to_array().map(|x| x as f32),
+                from: (crop.from - along.dot(view.eye_origin)) as f32,
+                lo: crop.ends[0] as f32,
+                hi: crop.ends[1] as f32,
             }
         });
         let [std, radius] = quality.kernel_shape();
@@ -182,6 +207,7 @@ impl FieldRule {
             range_per_cell: (255.0 / (cells * scene.span())) as f32,
             thickness: view.thickness as f32,
             faces,
+            crop: crop.collect(),
             face: face.collect(),
             whole: whole as f32,
             projection: view.projection,
@@ -193,7 +219,7 @@ impl FieldRule {
 
     /// Returns this rule without a cut-off: no pixel is ever shut.
     pub(crate) fn never_shut(&self) -> FieldRule {
-        FieldRule { face: self.face.clone(), eps: 0.0, ..*self }
+        FieldRule { crop: self.crop.clone(), face: self.face.clone(), eps: 0.0, ..*self }
     }
 
     /// Returns what a voxel adds to a sum for each unit of weight, from its sample's bits: 0 for
@@ -242,21 +268,12 @@ impl FieldRule {
         plane
     }
 
-    /// Index coordinates of a ray at depth `z`.
-    #[inline(always)]
-    fn index(&self, ray: &Ray, z: f32) -> [f32; 3] {
-        let [ex, ey] = [0, 1].map(|axis| ray.at[axis] + ray.slope[axis] * z);
-        self.faces.map(|faces| {
-            let [x, y, d] = faces.along;
-            x * ex + y * ey + d * z + faces.from
-        })
-    }
-
-    /// Divides the plane at index coordinates `q` by the kernel's weight inside the volume, near
-    /// its faces. Returns whether the plane lies outside there.
-    fn level(&self, plane: &mut Plane, q: [f32; 3]) -> bool {
+    /// Divides a plane at depth `z` by the kernel's weight inside the volume, near its faces.
+    /// Returns whether the plane lies outside there.
+    fn level(&self, plane: &mut Plane, ray: &Ray, z: f32) -> bool {
         let mut outside = false;
-        for (faces, q) in self.faces.iter().zip(q) {
+        for faces in &self.faces {
+            let q = faces.at(ray, z);
             outside |= (q < faces.lo) | (q > faces.hi);
             let [lo, lo_slope] = self.beside_face(q - faces.lo);
             let [hi, hi_slope] = self.beside_face(faces.hi - q);
@@ -283,16 +300,16 @@ impl FieldRule {
     /// its planes, and continues the field straight to a plane that lies outside, where few samples
     /// reach. Returns the part of the segment that is inside, in shares of it.
     fn end_at_faces(&self, segment: &mut Segment, ray: &Ray, z: f32) -> [f32; 2] {
-        let [front, back] = [z, z + self.thickness].map(|z| self.index(ray, z));
-        let near = |q: [f32; 3]| {
-            let mut faces = self.faces.iter().zip(q);
-            faces.any(|(f, q)| (q - f.lo < self.whole) | (f.hi - q < self.whole))
-        };
-        if !near(front) & !near(back) {
-            return [0.0, 1.0];
+        let ends = [z, z + self.thickness];
+        let near = |f: &Faces, reach: f32| ends.iter().any(|&z| f.depth(f.at(ray, z)) < reach);
+        if !self.faces.iter().any(|f| near(f, self.whole)) {
+            return match self.crop.iter().any(|f| near(f, 0.0)) {
+                true => self.clip(ray, z),
+                false => [0.0, 1.0],
+            };
         }
         let Segment { planes: [first, last], slopes } = segment;
-        let outside = [self.level(first, front), self.level(last, back)];
+        let outside = [self.level(first, ray, ends[0]), self.level(last, ray, ends[1])];
         *slopes = [self.along(ray, first), self.along(ray, last)];
         match outside {
             [true, false] => {
@@ -305,13 +322,15 @@ impl FieldRule {
             }
             _ => {}
         }
-        self.clip(ray, front)
+        self.clip(ray, z)
     }
 
-    /// Cuts the segment that begins at index coordinates `q` at the volume's faces: shares of it.
-    fn clip(&self, ray: &Ray, q: [f32; 3]) -> [f32; 2] {
+    /// Cuts the segment that begins at depth `z` at the faces of the volume and of the cropping box:
+    /// shares of it.
+    fn clip(&self, ray: &Ray, z: f32) -> [f32; 2] {
         let [mut from, mut to] = [0.0f32, 1.0f32];
-        for (faces, q) in self.faces.iter().zip(q) {
+        for faces in self.faces.iter().chain(&self.crop) {
+            let q = faces.at(ray, z);
             let [x, y, d] = faces.along;
             let step = (x * ray.slope[0] + y * ray.slope[1] + d) * self.thickness;
             let step = if step.abs() < 1e-12 { 1e-12 } else { step };
@@ -360,6 +379,28 @@ impl FieldRule {
                 shut
             }
         }
+    }
+
+    /// Returns the field at plane `k` of a pixel with these raw sums: its value as a sample code, and
+    /// the length of its gradient in codes per vox.
+    pub(crate) fn field_at(
+        &self,
+        scene: &FieldScene,
+        sums: [f32; 4],
+        pixel: [usize; 2],
+        k: i32,
+    ) -> (f64, f64) {
+        let mut plane = self.plane(sums);
+        let ray = self.ray(pixel.map(|p| p as i32));
+        self.level(&mut plane, &ray, (k as f32 + 0.5) * self.thickness);
+        let [x, y, z] = plane.gradient.map(f64::from);
+        let slope = (x * x + y * y + z * z).sqrt();
+        (scene.code(f64::from(plane.value + self.cell[0])), slope / scene.cells_per_code())
+    }
+
+    /// Returns how many codes above or below the background a raw sum stands for.
+    pub(crate) fn codes(&self, scene: &FieldScene, raw: f32) -> f64 {
+        f64::from(raw * self.cell[1]) / scene.cells_per_code()
     }
 
     /// Does for lane `i` of a row what [`FieldRule::close_row`] does for all.
@@ -417,8 +458,20 @@ impl FieldRule {
             let next = value(begin + step);
             let looks = scene.between(here, next);
             here = next;
-            let terms = shader.map(|s| self.terms(s, [first, last], begin + 0.5 * step, &ray));
-            let tau = looks[0] * h * step * row.secant[i];
+            let middle = begin + 0.5 * step;
+            let gradient = [0, 1, 2].map(|axis| {
+                let (from, to) = (first.gradient[axis], last.gradient[axis]);
+                from + (to - from) * middle
+            });
+            let extinction = match &scene.shares {
+                Some(shares) => {
+                    let [x, y, z] = gradient;
+                    looks[0] * shares.at((x * x + y * y + z * z).sqrt())
+                }
+                None => looks[0],
+            };
+            let terms = shader.map(|s| self.terms(s, gradient, &ray));
+            let tau = extinction * h * step * row.secant[i];
             let seen = (1.0 - row.a[i]) * opacity(tau);
             row.a[i] += seen;
             for c in 0..3 {
@@ -435,13 +488,9 @@ impl FieldRule {
         }
     }
 
-    /// The factor of base colours and what is added, at share `t` of a segment.
-    fn terms(&self, shader: &Shader, [first, last]: [&Plane; 2], t: f32, ray: &Ray) -> [f32; 2] {
+    /// The factor of base colours and what is added, where the field has a gradient (eye axes).
+    fn terms(&self, shader: &Shader, [gx, gy, gz]: [f32; 3], ray: &Ray) -> [f32; 2] {
         let [ex, ey, ez] = ray.to_eye;
-        let [gx, gy, gz] = [0, 1, 2].map(|axis| {
-            let (from, to) = (first.gradient[axis], last.gradient[axis]);
-            from + (to - from) * t
-        });
         let side = if gx * ex + gy * ey + gz * ez < 0.0 { -1.0 } else { 1.0 };
         let x = gx * side + self.flat * ex;
         let y = gy * side + self.flat * ey;

@@ -112,6 +112,19 @@ impl Looks {
         self.of.optics_at(code)
     }
 
+    /// Returns whether the extinction depends on the gradient.
+    pub(super) fn is_modulated(&self) -> bool {
+        self.of.is_modulated()
+    }
+
+    /// Factor of the extinction for a gradient in codes per vox.
+    pub(super) fn gradient_factor(&self, gradient: DVec3) -> f64 {
+        if !self.is_modulated() || gradient.is_nan() {
+            return 1.0;
+        }
+        self.of.gradient_factor(gradient.length() / (self.max_code - self.min_code))
+    }
+
     /// Returns extinction and colour at the bends between two codes; `None` if there are none.
     pub(super) fn bends(&self, lo: f64, hi: f64) -> Option<Bends> {
         let from = self.bends.partition_point(|&b| b < lo - self.beside);

@@ -4,7 +4,7 @@
 //! Only pixels beside a face of the volume leave the registers ([`FieldRule::end_at_faces`]): few
 //! do.
 
-use super::tables::{CELLS, FEW_CELLS};
+use super::tables::{CELLS, FEW_CELLS, GradientShares, SHARES};
 use super::{FieldRule, FieldScene, Plane, Ray, STEPS, Segment};
 use crate::kernels::LARGEST;
 use crate::kernels::composite::{LANES, ONE, Row};
@@ -231,22 +231,24 @@ unsafe fn plane<L: Floats>(
     }
 }
 
-/// Lanes in which the plane at depth `z` is near a face of the volume.
+/// Lanes in which the plane at depth `z` is near a face of the volume, or outside the cropping
+/// box.
 #[inline(always)]
 unsafe fn near<L: Floats>(rule: &FieldRule, rays: &Rays<L::Floats>, z: f32) -> u32 {
     // SAFETY: the caller has these instructions.
     unsafe {
         let ex = L::add(rays.at[0], L::mul(rays.slope[0], L::all(z)));
         let ey = L::add(rays.at[1], L::mul(rays.slope[1], L::all(z)));
-        let mut least = L::all(f32::INFINITY);
-        for faces in &rule.faces {
+        let mut near = 0;
+        for (i, faces) in rule.faces.iter().chain(&rule.crop).enumerate() {
             let [x, y, d] = faces.along;
             let q = L::add(L::mul(L::all(x), ex), L::mul(L::all(y), ey));
             let q = L::add(L::add(q, L::all(d * z)), L::all(faces.from));
-            least = L::least(L::sub(q, L::all(faces.lo)), least);
-            least = L::least(L::sub(L::all(faces.hi), q), least);
+            let depth = L::least(L::sub(q, L::all(faces.lo)), L::sub(L::all(faces.hi), q));
+            let reach = if i < rule.faces.len() { rule.whole } else { 0.0 };
+            near |= L::bits(L::below(depth, L::all(reach)));
         }
-        L::bits(L::below(least, L::all(rule.whole)))
+        near
     }
 }
 
@@ -265,22 +267,36 @@ unsafe fn along<L: Floats>(
     }
 }
 
-/// The factors of base colours and what is added, at shares `t` of segments.
+/// Factors of the extinction where the field has these gradients: [`GradientShares::at`].
+#[inline(always)]
+unsafe fn shares<L: Floats>(shares: &GradientShares, gradient: [L::Floats; 3]) -> L::Floats {
+    // SAFETY: the caller has these instructions. Entries looked up are below `SHARES`, so that each
+    // and the one behind it is in the table.
+    unsafe {
+        let slope = L::sqrt(dot::<L>(gradient, gradient));
+        let x = L::mul(slope, L::all(shares.per_slope));
+        let x = L::least(x, L::all(SHARES as f32));
+        let i = L::min(L::truncated(x), L::set(SHARES as i32 - 1));
+        let share = L::sub(x, L::to_floats(i));
+        let all = L::marks(u32::MAX);
+        let table = shares.factors.as_ptr();
+        let low = L::from_bits(L::look_up(all, table.cast(), i));
+        let high = L::from_bits(L::look_up(all, table.add(1).cast(), i));
+        L::add(low, L::mul(L::sub(high, low), share))
+    }
+}
+
+/// The factors of base colours and what is added, where the field has these gradients.
 #[inline(always)]
 unsafe fn terms<L: Floats>(
     (rule, shader): (&FieldRule, &Shader),
-    [first, last]: [&Planes<L::Floats>; 2],
-    t: L::Floats,
+    gradient: [L::Floats; 3],
     rays: &Rays<L::Floats>,
 ) -> [L::Floats; 2] {
     // SAFETY: the caller has these instructions.
     unsafe {
         let to_eye = rays.to_eye;
-        let mut n = first.gradient;
-        for axis in 0..3 {
-            let rise = L::sub(last.gradient[axis], n[axis]);
-            n[axis] = L::add(n[axis], L::mul(rise, t));
-        }
+        let mut n = gradient;
         let away = L::below(dot::<L>(n, to_eye), L::all(0.0));
         let side = L::select(away, L::all(-1.0), L::all(1.0));
         for axis in 0..3 {
@@ -460,18 +476,24 @@ unsafe fn close<L: Floats>(
                     _ => eight,
                 };
                 let looks = between::<L>(scene, [value, next], active, &mut integral);
+                let middle = L::add(begin, L::mul(L::all(0.5), step));
+                let mut gradient = first.gradient;
+                for axis in 0..3 {
+                    let rise = L::sub(last.gradient[axis], gradient[axis]);
+                    gradient[axis] = L::add(gradient[axis], L::mul(rise, middle));
+                }
+                let extinction = match &scene.shares {
+                    Some(table) => L::mul(looks[0], shares::<L>(table, gradient)),
+                    None => looks[0],
+                };
                 let marks = L::marks(active);
-                let tau = L::mul(L::mul(looks[0], L::all(h)), step);
+                let tau = L::mul(L::mul(extinction, L::all(h)), step);
                 let tau = L::only(marks, L::mul(tau, secant));
                 if L::bits(L::below(zero, tau)) != 0 {
                     let seen = L::mul(L::sub(one, opacities), opacity::<L>(tau));
                     opacities = L::add(opacities, seen);
                     let lit = match shader {
-                        Some(shader) => {
-                            let middle = L::add(begin, L::mul(L::all(0.5), step));
-                            let planes = [&first, &last];
-                            Some(terms::<L>((rule, shader), planes, middle, &rays))
-                        }
+                        Some(shader) => Some(terms::<L>((rule, shader), gradient, &rays)),
                         None => None,
                     };
                     for c in 0..3 {

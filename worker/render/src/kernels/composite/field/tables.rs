@@ -1,6 +1,7 @@
 //! Tables of a field's transfer function: looks by value, and their integrals.
 
 use crate::kernels::truncate;
+use glam::DVec3;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::transfer::{Classifier, OpticalSample};
 use slabcast_common::volume::{SampleKind, ValueSummary};
@@ -8,15 +9,62 @@ use slabcast_common::volume::{SampleKind, ValueSummary};
 /// Cells of the tables over the visible values.
 pub(super) const CELLS: usize = 4096;
 
+/// Steps of the table of factors by gradient.
+pub(super) const SHARES: usize = 1024;
+
 /// Cells that a sub-step's values must span for the integral tables to be used. Within fewer the
 /// transfer function is taken where the middle is; differences of f32 integrals would lose digits.
 pub(super) const FEW_CELLS: f32 = 16.0;
+
+/// Two parallel faces of the cropping box, along a world axis.
+#[derive(Debug)]
+pub(super) struct CropFaces {
+    /// World coordinate from the volume's centre, of index coordinates: `along . index + from`.
+    pub(super) along: DVec3,
+    pub(super) from: f64,
+    /// Coordinates of the faces; infinite where nothing is cropped.
+    pub(super) ends: [f64; 2],
+}
+
+/// Factors of the extinction by the gradient's magnitude.
+#[derive(Debug)]
+pub(super) struct GradientShares {
+    /// Factors at equal distances from magnitude 0 on; all beyond have the last.
+    pub(super) factors: Box<[f32; SHARES + 1]>,
+    /// Entries for a change of value by one cell per vox.
+    pub(super) per_slope: f32,
+}
+
+impl GradientShares {
+    fn new(classifier: &Classifier, cells: f64) -> Option<GradientShares> {
+        let steepest = classifier.steepest_gradient()?;
+        let steepest = if steepest > 0.0 { steepest } else { 1.0 };
+        let share = |i: usize| steepest * (i as f64 / SHARES as f64);
+        let factors: Vec<f32> =
+            (0..=SHARES).map(|i| classifier.gradient_factor(share(i)) as f32).collect();
+        let factors = factors.try_into().unwrap_or_else(|_| unreachable!("an entry for each"));
+        Some(GradientShares { factors, per_slope: (SHARES as f64 / (steepest * cells)) as f32 })
+    }
+
+    /// Factor where the value changes by `slope` cells per vox.
+    pub(super) fn at(&self, slope: f32) -> f32 {
+        let x = slope * self.per_slope;
+        let x = if x < SHARES as f32 { x } else { SHARES as f32 };
+        let i = (truncate(x) as usize).min(SHARES - 1);
+        let [low, high] = [self.factors[i], self.factors[i + 1]];
+        low + (high - low) * (x - i as f32)
+    }
+}
 
 /// Values of a scene: how codes become sums, and what values look like.
 #[derive(Debug)]
 pub struct FieldScene {
     /// Code of which a sheet holds nothing: the smallest code of the volume, or the largest.
     pub(super) background: f64,
+    /// Samples along each index axis.
+    pub(super) dims: [u32; 3],
+    /// The cropping box along the axes that it crops.
+    pub(super) crop: Vec<CropFaces>,
     /// Smallest and largest code.
     pub(super) range: [f64; 2],
     /// Codes of the first and the last cell's ends.
@@ -28,7 +76,9 @@ pub struct FieldScene {
     pub(super) looks: Box<[OpticalSample; CELLS + 1]>,
     /// Integrals of extinction, and of extinction times colour, up to each cell's end, in cells.
     pub(super) integrals: Box<[OpticalSample; CELLS + 1]>,
-    /// Largest extinction per vox up to each cell's end.
+    /// Factors of the extinction by gradient; `None` if it does not depend on it.
+    pub(super) shares: Option<GradientShares>,
+    /// Largest extinction per vox up to each cell's end, for a factor of 1.
     pub(super) most: Box<[f32; CELLS + 1]>,
 }
 
@@ -61,17 +111,31 @@ impl FieldScene {
             }
             integrals.push(sum);
         }
+        let span = (summary.max_code - summary.min_code).max(f64::MIN_POSITIVE);
+        let cells_of_range = span * CELLS as f64 / (hull[1] - hull[0]);
         let mut most = 0.0f64;
         let sample = |[sigma, rgb @ ..]: [f64; 4]| OpticalSample {
             sigma: sigma as f32,
             rgb: rgb.map(|c| c as f32),
         };
+        let lattice = &spec.volume.lattice;
+        let crop = spec.crop.iter().flat_map(|crop| {
+            let world = lattice.world_from_index();
+            (0..3).map(move |axis| CropFaces {
+                along: world.row(axis),
+                from: -world.row(axis).dot(lattice.centre_index()),
+                ends: [crop.lo[axis], crop.hi[axis]],
+            })
+        });
         FieldScene {
             background,
+            dims: lattice.dims,
+            crop: crop.filter(|f| f.ends.iter().any(|end| end.is_finite())).collect(),
             range: [summary.min_code, summary.max_code],
             hull,
             visible,
             kind: summary.kind,
+            shares: GradientShares::new(classifier, cells_of_range),
             most: table(looks.iter().map(|look| {
                 most = most.max(look[0]);
                 most as f32
@@ -79,6 +143,16 @@ impl FieldScene {
             looks: table(looks.iter().copied().map(sample)),
             integrals: table(integrals.into_iter().map(sample)),
         }
+    }
+
+    /// Cells of the tables for one code.
+    pub(super) fn cells_per_code(&self) -> f64 {
+        CELLS as f64 / (self.hull[1] - self.hull[0])
+    }
+
+    /// The sample code of a value in cells.
+    pub(super) fn code(&self, value: f64) -> f64 {
+        self.hull[0] + value / self.cells_per_code()
     }
 
     /// Codes from the smallest to the largest.

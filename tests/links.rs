@@ -40,7 +40,7 @@ fn request(key: &str, projection: ProjectionKind, work: Work) -> PathRequest {
         client_key: key.into(),
         path: ViewPath::from_turntable([150, 110], turn),
         transfer: TransferChoice::Name("auto".into()),
-        quality: Quality::default(),
+        quality: Quality::before(),
         work,
         format: PixelFormat::Rgba32F,
         background: Background::Transparent,
@@ -356,9 +356,9 @@ fn truth_of_each(path: &ViewPath, default: &TransferFunction) -> Vec<String> {
     let frame = |i: usize| {
         let at = (path.first_frame() + i) as f64;
         let transfer = tween.as_ref().map_or(default.clone(), |t| t.transfer_at(at));
-        let classifier = Classifier::new(&transfer, &info, Quality::default().compositing);
-        let sums = classifier.choose_sums(&Quality::default(), &info.lattice).unwrap();
-        let quality = Quality { sums, ..Quality::default() };
+        let classifier = Classifier::new(&transfer, &info, Quality::before().compositing);
+        let sums = classifier.choose_sums(&Quality::before(), &info.lattice).unwrap();
+        let quality = Quality { sums, ..Quality::before() };
         let crop = path.crop.map(|c| c.resolve(&info.lattice).unwrap());
         let wanted = BrickNeeds { crop, ..BrickNeeds::for_transfer(&transfer, &info, &quality) };
         let store = BrickStore::build(&volume, info.digest, &wanted);

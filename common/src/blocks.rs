@@ -127,7 +127,7 @@ mod tests {
             let to_eye = DVec3::new(libm::sin(azimuth), libm::cos(azimuth), tilt);
             let target = DVec3::from_array(target);
             let camera = Camera { to_eye, up: DVec3::Z, target, projection };
-            let q = Quality { thickness: d, ..Quality::default() };
+            let q = Quality { thickness: d, ..Quality::before() };
             let view = View::new(&l, &camera, [120, 100], &q).unwrap();
             let boxes = boxes.into_iter().map(|(lo, more)| {
                 TightBox { lo, hi: std::array::from_fn(|a| lo[a] + more[a]) }

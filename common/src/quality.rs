@@ -24,9 +24,9 @@ pub enum Kernel {
 pub enum Classify {
     /// Values are reconstructed, then classified and lit at each sample of a ray: sharp surfaces
     /// without rings (docs/design/sharp.md).
+    #[default]
     After,
     /// Voxels are classified and lit, then blurred by the kernel, as in the paper (section 3).
-    #[default]
     Before,
 }
 
@@ -83,8 +83,9 @@ pub struct Quality {
     pub std: f64,
     /// Support radius of the Gaussian in lattice steps, 1 to 3; other kernels have one radius.
     pub radius: f64,
-    /// Whether values are classified after or before the kernel reconstructs them.
-    #[serde(skip_serializing_if = "is_default")]
+    /// Whether values are classified after or before the kernel reconstructs them. JSON of versions
+    /// that only had the latter says nothing.
+    #[serde(default = "before")]
     pub classify: Classify,
     /// Rule by which sheets become opacity: extinction as here, or the paper's.
     pub compositing: Compositing,
@@ -105,25 +106,19 @@ fn is_true(b: &bool) -> bool {
     *b
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
-fn is_default(classify: &Classify) -> bool {
-    *classify == Classify::default()
+fn before() -> Classify {
+    Classify::Before
 }
 
 impl Default for Quality {
+    /// Returns the default quality of pictures: classified after reconstruction with the cubic
+    /// B-spline, planes of 2/3 vox (docs/design/sharp.md).
     fn default() -> Self {
         Quality {
-            thickness: 1.0,
-            eps: 1.0 / 512.0,
-            kernel: Kernel::Gaussian,
-            std: 0.6,
-            radius: 2.0,
-            classify: Classify::default(),
-            compositing: Compositing::Linear,
-            splat: Splat::Direct,
-            sums: Sums::Auto,
-            cull: true,
-            grey: true,
+            thickness: 2.0 / 3.0,
+            kernel: Kernel::Bspline,
+            classify: Classify::After,
+            ..Quality::before()
         }
     }
 }
@@ -168,6 +163,32 @@ fn within(field: &str, x: f64, lo: f64, hi: f64) -> Result<(), InvalidField> {
 }
 
 impl Quality {
+    /// Returns the default quality of the paper's order, classification before reconstruction: a
+    /// Gaussian kernel, sheets of one vox.
+    pub fn before() -> Quality {
+        Quality {
+            thickness: 1.0,
+            eps: 1.0 / 512.0,
+            kernel: Kernel::Gaussian,
+            std: 0.6,
+            radius: 2.0,
+            classify: Classify::Before,
+            compositing: Compositing::Linear,
+            splat: Splat::Direct,
+            sums: Sums::Auto,
+            cull: true,
+            grey: true,
+        }
+    }
+
+    /// Returns the default quality of an order of classification.
+    pub fn of(classify: Classify) -> Quality {
+        match classify {
+            Classify::After => Quality::default(),
+            Classify::Before => Quality::before(),
+        }
+    }
+
     /// Returns standard deviation and support radius of the kernel in lattice steps.
     pub fn kernel_shape(&self) -> [f64; 2] {
         match self.kernel {
@@ -198,7 +219,7 @@ impl Quality {
         within("std", self.std, 0.4, 1.0)?;
         within("radius", self.radius, 1.0, 3.0)?;
         if self.kernel != Kernel::Gaussian {
-            let d = Quality::default();
+            let d = Quality::before();
             for (field, given) in [("std", self.std != d.std), ("radius", self.radius != d.radius)]
             {
                 if given {

@@ -20,7 +20,7 @@ fn encoding_ten_thousand_bricks_for_sixteen_workers() {
     });
     let transfer = presets::by_name("peer-opaque", &volume.summary).expect("a preset");
     let info = volume.info(volume.digest());
-    let wanted = BrickNeeds::for_transfer(&transfer, &info, &Quality::default());
+    let wanted = BrickNeeds::for_transfer(&transfer, &info, &Quality::before());
     let store = BrickStore::build(&volume, info.digest, &wanted);
     let ids: Vec<_> = store.infos().iter().map(|b| b.id).take(10_000).collect();
     assert_eq!(ids.len(), 10_000);

@@ -305,7 +305,7 @@ fn stats_with(tiles: usize) -> FrameStats {
         bricks: Default::default(),
         result_bytes: None,
         slabs: vec![slab],
-        quality: Quality::default(),
+        quality: Quality::before(),
         left_out: vec![],
         error: Default::default(),
         retries: 0,

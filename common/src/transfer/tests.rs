@@ -64,7 +64,7 @@ fn alpha_one_is_capped_and_extinction_is_not() {
     let c = Classifier::new(&tf, &info, Compositing::Linear);
     assert_eq!(c.classify(&Samples::U8(vec![3]), 0).sigma, 1e6);
     assert!(c.is_uncapped());
-    let sums = |sums| c.choose_sums(&Quality { sums, ..Quality::default() }, &info.lattice);
+    let sums = |sums| c.choose_sums(&Quality { sums, ..Quality::before() }, &info.lattice);
     assert_eq!(sums(Sums::Auto), Ok(Sums::F32));
     assert_eq!(sums(Sums::I32).unwrap_err().field, "sums");
 }
@@ -78,7 +78,7 @@ fn sixteen_bits_are_for_scenes_that_they_round_little_of() {
         Classifier::new(&tf(points), &info, quality.compositing)
             .choose_sums(&quality, &info.lattice)
     };
-    let q = Quality::default();
+    let q = Quality::before();
     let ramp = |top| vec![[0.0, 0.0], [255.0, top]];
     // One opacity: nothing is faint beside it.
     let step = |top| vec![[100.0, 0.0], [100.0, top]];

@@ -33,7 +33,7 @@ proptest! {
     ) {
         let l = Lattice::from_spacing([9, 7, 5], [2.0; 3]);
         let c = camera(azimuth, tilt, CameraProjection::Persp { fov: 30.0, distance });
-        let v = View::new(&l, &c, [64, 48], &Quality::default()).unwrap();
+        let v = View::new(&l, &c, [64, 48], &Quality::before()).unwrap();
         // The eye itself sees no direction to it.
         let Projection::Persp { distance, .. } = v.projection else { unreachable!() };
         let at = [at, vec![[0.0, 0.0, -distance]]].concat();
@@ -53,7 +53,7 @@ fn picture_axes_are_right_handed() {
     // Seen from +y (the front), +x must be on the left: right = forward x up = -y x z = -x.
     let l = Lattice::from_spacing([9, 9, 9], [2.0; 3]);
     let c = camera(0.0, 0.0, CameraProjection::Ortho { height: 36.0 });
-    let v = View::new(&l, &c, [90, 90], &Quality::default()).unwrap();
+    let v = View::new(&l, &c, [90, 90], &Quality::before()).unwrap();
     let at = |p: [u32; 3]| {
         let e = v.corner_in_eye(p);
         v.screen(e.x, e.y, v.scale_at(0).unwrap()).map(|s| s as f64 / f64::from(SUBPIXELS))
@@ -67,7 +67,7 @@ fn picture_axes_are_right_handed() {
 #[test]
 fn views_depend_neither_on_unit_nor_on_origin() {
     let c = camera(0.3, 0.2, CameraProjection::Ortho { height: 36.0 });
-    let q = Quality::default();
+    let q = Quality::before();
     let l = Lattice::from_spacing([9, 7, 5], [2.0; 3]);
     let v = View::new(&l, &c, [64, 48], &q).unwrap();
     let far = Lattice { origin: DVec3::splat(2e7), ..l };
@@ -84,7 +84,7 @@ fn with_thickness_of_equals_a_view_made_with_that_thickness() {
         let l = Lattice::from_spacing([9, 7, 5], spacing);
         for tilt in [0.0, 0.7] {
             let of = |q| View::new(&l, &camera(0.3, tilt, p), [64, 48], &q).unwrap();
-            let q = Quality::default();
+            let q = Quality::before();
             let other = Quality { thickness: 0.5 * q.thickness, ..q };
             assert_eq!(of(q).with_thickness_of(&other), of(other), "{spacing:?}, tilt {tilt}");
             assert_ne!(of(q), of(other));
@@ -92,7 +92,7 @@ fn with_thickness_of_equals_a_view_made_with_that_thickness() {
     }
     // It is more than the thickness: widths of what leans.
     let l = Lattice::from_spacing([9, 7, 5], [1.0, 1.0, 2.5]);
-    let q = Quality::default();
+    let q = Quality::before();
     let leaning = View::new(&l, &camera(0.3, 0.7, p), [64, 48], &q).unwrap();
     let thin = leaning.with_thickness_of(&Quality { thickness: 0.25, ..q });
     assert!(thin.kernel_std.y < leaning.kernel_std.y, "{thin:?}");
@@ -101,7 +101,7 @@ fn with_thickness_of_equals_a_view_made_with_that_thickness() {
 #[test]
 fn undrawable_cameras_are_refused_by_field() {
     let l = Lattice::from_spacing([9, 7, 5], [2.0; 3]);
-    let q = Quality::default();
+    let q = Quality::before();
     let good = camera(0.3, 0.2, CameraProjection::Ortho { height: 36.0 });
     let field = |c: Camera, size| View::new(&l, &c, size, &q).unwrap_err().field;
     assert_eq!(field(Camera { to_eye: DVec3::NAN, ..good }, [9, 9]), "eye");
@@ -131,7 +131,7 @@ proptest! {
         } else {
             CameraProjection::Ortho { height: 25.0 }
         };
-        let q = Quality { thickness: d, ..Quality::default() };
+        let q = Quality { thickness: d, ..Quality::before() };
         let v = View::new(&l, &camera(azimuth, tilt, p), [120, 100], &q).unwrap();
         let base = [corner.0 * 8, corner.1 * 8, corner.2 * 8];
         let boxed = TightBox { lo: base, hi: base.map(|x| x + 7) };

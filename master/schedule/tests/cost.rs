@@ -34,7 +34,7 @@ fn cost(n: u32, edge: u32, height: f64, workers: u64, work: Work) -> f64 {
     let mut info = small.info(Digest32([1; 32]));
     info.lattice.dims = dims;
     let transfer = presets::by_name("grey", &info.summary).expect("a known name");
-    let quality = Quality::default();
+    let quality = Quality::before();
     let camera = Camera {
         to_eye: [0.3, 0.5, 1.0].into(),
         up: [0.0, 1.0, 0.0].into(),

@@ -26,7 +26,7 @@ const DIMS: [u32; 3] = [256; 3];
 fn ball(frames: usize) -> (Vec<FrameJob>, Trace) {
     let info = Volume::from_fn_u8("v", DIMS, |i, _, _| i as u8).info(Digest32([1; 32]));
     let transfer = presets::by_name("grey", &info.summary).expect("a known name");
-    let quality = Quality::default();
+    let quality = Quality::before();
     let grid = BrickGrid::new(DIMS);
     let from_centre = |id: u32| -> [f64; 3] {
         grid.corner(BrickId(id)).map(|x| f64::from(x) + f64::from(BRICK_EDGE) / 2.0 - 128.0)

@@ -31,7 +31,7 @@ fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
     let dims = [64; 3];
     let info = Volume::from_fn_u8("v", dims, |i, _, _| i as u8).info(Digest32([1; 32]));
     let transfer = presets::by_name("grey", &info.summary).expect("a known name");
-    let quality = Quality::default();
+    let quality = Quality::before();
     let grid = BrickGrid::new(dims);
     let bricks: Arc<[BrickInfo]> = (0..grid.len() as u32)
         .map(|id| {

@@ -31,7 +31,7 @@ fn request(key: &str, frames: u32, preset: &str) -> PathRequest {
         client_key: key.into(),
         path: ViewPath::from_turntable(SIZE, Turntable { frames, ..Turntable::default() }),
         transfer: TransferChoice::Name(preset.into()),
-        quality: Quality::default(),
+        quality: Quality::before(),
         work: Work::default(),
         format: PixelFormat::Rgb8,
         background: Background::Transparent,

@@ -57,7 +57,7 @@ mod tests {
             id: SceneId(5),
             transfer: presets::by_name("peer-semi", &volume.summary).unwrap(),
             volume: volume.info(Digest32([7; 32])),
-            quality: Quality { sums: Sums::I32, ..Quality::default() },
+            quality: Quality { sums: Sums::I32, ..Quality::before() },
             crop: None,
             bricks: BrickSetKey(Digest32([9; 32])),
         };

@@ -69,7 +69,7 @@ fn jobs(rng: &mut Rng, schedule: Schedule) -> Vec<FrameJob> {
     let volume = Volume::from_fn_u8("v", [40, 32, 24], |i, j, k| (i * 3 + j + k) as u8);
     let info = volume.info(Digest32([3; 32]));
     let transfer = presets::by_name("grey", &info.summary).expect("a known name");
-    let quality = Quality { sums: Sums::I32, ..Quality::default() };
+    let quality = Quality { sums: Sums::I32, ..Quality::before() };
     let set = BrickSetKey(Digest32([9; 32]));
     let grid = BrickGrid::new(info.lattice.dims);
     let bricks: Arc<[BrickInfo]> = (0..grid.len() as u32)

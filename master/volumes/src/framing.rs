@@ -145,7 +145,7 @@ pub fn framing(
         return Ok(None);
     }
     let tween = Tween::from_path(path, &info.summary)?;
-    let quality = Quality { classify: Classify::Before, ..Quality::default() };
+    let quality = Quality { classify: Classify::Before, ..Quality::before() };
     let needs = BrickNeeds::for_path(path, transfer, tween.as_ref(), info, &quality)?;
     let points = outline(volume, &needs.support, needs.crop.as_ref());
     path.framing(&points, &info.lattice, orientation)

@@ -169,7 +169,7 @@ fn real_head_bricks_match_a_plain_loop() {
     let v = volume(&path);
     let digest = v.digest();
     let tf = presets::by_name("peer-opaque", &v.summary).unwrap();
-    let wanted = BrickNeeds::for_transfer(&tf, &v.info(digest), &Quality::default());
+    let wanted = BrickNeeds::for_transfer(&tf, &v.info(digest), &Quality::before());
     let store = BrickStore::build(&v, digest, &wanted);
     println!("mri256: open, digest, build {:?}", start.elapsed());
     let m = v.gradient_matrix();

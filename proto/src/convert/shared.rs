@@ -13,10 +13,10 @@ use slabcast_common::shade::{HeadWord, Light, Shading};
 use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::volume::SampleKind;
 
-enum_conversions!(kernel_to_wire, kernel_from_wire, Kernel, wire::Kernel, Some(Kernel::Gaussian),
+enum_conversions!(kernel_to_wire, kernel_from_wire, Kernel, wire::Kernel, None,
     { Gaussian <=> Gaussian, Bspline <=> Bspline, Tent <=> Tent });
 enum_conversions!(classify_to_wire, classify_from_wire, Classify, wire::Classify,
-    Some(Classify::Before),
+    None,
     { After <=> After, Before <=> Before });
 enum_conversions!(compositing_to_wire, compositing_from_wire, Compositing, wire::Compositing,
     Some(Compositing::Linear),
@@ -55,16 +55,27 @@ pub(super) fn quality_to_wire(q: &Quality) -> wire::Quality {
     }
 }
 
-/// A quality; fields that are left out have their defaults.
-pub(super) fn quality_from_wire(q: wire::Quality) -> Result<Quality, WireError> {
-    let d = Quality::default();
+/// A quality; fields that are left out have their defaults. `classify` is the order that a message
+/// without one means.
+pub(super) fn quality_from_wire(
+    q: wire::Quality,
+    classify: Classify,
+) -> Result<Quality, WireError> {
+    let classify = match q.classify {
+        0 => classify,
+        given => classify_from_wire("classify", given)?,
+    };
+    let d = Quality::of(classify);
     let quality = Quality {
         thickness: q.thickness.unwrap_or(d.thickness),
         eps: q.eps.unwrap_or(d.eps),
-        kernel: kernel_from_wire("kernel", q.kernel)?,
+        kernel: match q.kernel {
+            0 => d.kernel,
+            given => kernel_from_wire("kernel", given)?,
+        },
         std: q.std.unwrap_or(d.std),
         radius: q.radius.unwrap_or(d.radius),
-        classify: classify_from_wire("classify", q.classify)?,
+        classify,
         compositing: compositing_from_wire("compositing", q.compositing)?,
         splat: splat_from_wire("splat", q.splat)?,
         sums: sums_from_wire("sums", q.sums)?,

@@ -164,7 +164,7 @@ pub fn quality(sums: impl Strategy<Value = Sums>) -> impl Strategy<Value = Quali
         Just(Compositing::Constant),
         Just(Compositing::Paper)
     ];
-    let d = Quality::default();
+    let d = Quality::before();
     let kernel = prop_oneof![
         (Just(Kernel::Gaussian), 0.4..1.0f64, 1.0..3.0f64),
         (prop_oneof![Just(Kernel::Bspline), Just(Kernel::Tent)], Just(d.std), Just(d.radius)),
@@ -182,7 +182,7 @@ pub fn quality(sums: impl Strategy<Value = Sums>) -> impl Strategy<Value = Quali
                 compositing,
                 sums,
                 cull,
-                ..Quality::default()
+                ..Quality::before()
             };
             // Values are not reconstructed at every quality.
             let before = Quality { classify: Classify::Before, ..all };

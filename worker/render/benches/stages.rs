@@ -62,7 +62,7 @@ struct How {
 
 impl Default for How {
     fn default() -> How {
-        let quality = Quality { sums: Sums::I32, ..Quality::default() };
+        let quality = Quality { sums: Sums::I32, ..Quality::before() };
         How { opacity: 0.9, grey: false, shaded: true, perspective: false, edge: 128, quality }
     }
 }
@@ -186,14 +186,14 @@ fn splat_fog_unlit(bencher: Bencher<'_, '_>) {
 /// Fog in 16-bit sums.
 #[divan::bench]
 fn splat_fog_16_bit_sums(bencher: Bencher<'_, '_>) {
-    let quality = Quality { sums: Sums::I16, ..Quality::default() };
+    let quality = Quality { sums: Sums::I16, ..Quality::before() };
     How { opacity: 0.004, quality, ..How::default() }.stage().bench(bencher, |c| c.splatted);
 }
 
 /// Fog in float sums, which are added in one order.
 #[divan::bench]
 fn splat_fog_float_sums(bencher: Bencher<'_, '_>) {
-    let quality = Quality { sums: Sums::F32, ..Quality::default() };
+    let quality = Quality { sums: Sums::F32, ..Quality::before() };
     How { opacity: 0.004, quality, ..How::default() }.stage().bench(bencher, |c| c.splatted);
 }
 

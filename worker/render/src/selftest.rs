@@ -81,7 +81,7 @@ pub fn run(simd: Simd) -> Digest32 {
         (Sums::I16, ortho, 0.0),
     ];
     for (sums, projection, up) in ways {
-        let quality = Quality { sums, ..Quality::default() };
+        let quality = Quality { sums, ..Quality::before() };
         let spec = spec(&volume, quality);
         let camera = Camera {
             to_eye: DVec3::new(0.6, 1.0, up),

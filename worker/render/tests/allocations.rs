@@ -139,7 +139,7 @@ fn second_turntable_allocates_nothing_while_drawing() {
         ("general", true, Sums::F32, Compositing::Linear, OpacityUnit::Extinction),
     ];
     for (room, persp, sums, compositing, unit) in rooms {
-        let quality = Quality { sums, compositing, ..Quality::default() };
+        let quality = Quality { sums, compositing, ..Quality::before() };
         let spec = SceneSpec {
             id: SceneId(1),
             volume: volume.info(Digest32::default()),

@@ -61,7 +61,7 @@ impl World {
 
         let volume = Volume::from_fn_u8("pair", [16, 8, 8], |_, _, _| 200);
         assert_eq!(BrickGrid::new(volume.lattice.dims).len(), 2);
-        let quality = Quality { sums: Sums::I32, ..Quality::default() };
+        let quality = Quality { sums: Sums::I32, ..Quality::before() };
         let mut transfer = presets::by_name("peer-opaque", &volume.summary).unwrap();
         transfer.shading.on = false;
         let path = ViewPath::from_turntable([32, 32], Turntable::default());

@@ -141,7 +141,7 @@ mod tests {
         let open = |identity: &str| {
             MeasurementCache::open_in(Some(dir.path().join("a/b")), identity.into())
         };
-        let setting = Setting::asked(Quality::default());
+        let setting = Setting::asked(Quality::before());
         let mut kept = open("one");
         assert_eq!((kept.len(), kept.ms(&setting)), (0, None));
         kept.put_ms(&setting, 12.5);

@@ -340,13 +340,13 @@ mod tests {
 
     #[test]
     fn ladder_of_settings_is_valid_and_ordered_from_coarse_to_fine() {
-        let base = Setting::asked(Quality::default());
+        let base = Setting::asked(Quality::before());
         let all = ladder(&base, [512, 512]);
         assert_eq!(all.len(), 16);
         assert!(all.iter().all(|s| s.quality.check().is_ok()));
         let odd = ladder(&base, [511, 512]);
         assert!(odd.iter().all(|s| s.shrink == 1) && odd.len() == 11);
-        let tent = Setting::asked(Quality { kernel: Kernel::Tent, ..Quality::default() });
+        let tent = Setting::asked(Quality { kernel: Kernel::Tent, ..Quality::before() });
         assert!(ladder(&tent, [512, 512]).iter().all(|s| s.quality.sums == Sums::Auto));
     }
 

@@ -126,7 +126,7 @@ mod tests {
 
     #[test]
     fn setting_is_named_by_its_differences() {
-        let base = Setting::asked(Quality::default());
+        let base = Setting::asked(Quality::before());
         assert_eq!(base.name(&base), "as asked");
         assert_eq!(base.flags(&base, [512, 512]), "");
         let q = Quality { thickness: 0.5, eps: 1.0 / 64.0, sums: Sums::I16, ..base.quality };

@@ -38,12 +38,18 @@ type Tweak = fn(&mut Quality);
 /// A formula volume, the case's name, the transfer function, and the change of quality.
 type Formula = (&'static str, &'static str, &'static str, Tweak);
 
-/// Formula volumes and what each covers: lit and opaque; faint and unlit, where nothing hides
+/// Classification after reconstruction, as pictures have it by default.
+fn after(quality: &mut Quality) {
+    *quality = Quality::default();
+}
+
+/// Formula volumes and what each covers: lit and opaque; classified after reconstruction; faint and unlit, where nothing hides
 /// anything; 16-bit; float with a ramp of opacity; step edges in thin sheets; one voxel; a line
 /// longer than any picture; each compositing rule; sums in floats; nothing shut at all; 16-bit
 /// sums; each kernel.
-const FORMULAS: [Formula; 14] = [
+const FORMULAS: [Formula; 15] = [
     ("formula:spheres", "spheres/auto", "auto", |_| {}),
+    ("formula:spheres", "spheres/peer-vessels/after", "peer-vessels", after),
     ("formula:fog", "fog/grey", "grey", |_| {}),
     ("formula:blob", "blob/extinction", "extinction", |_| {}),
     ("formula:ramp", "ramp/peer-semi/constant", "peer-semi", |q| {
@@ -72,15 +78,16 @@ const FORMULAS: [Formula; 14] = [
 
 /// Number of [`FORMULAS`] in the matrix: those that take different code paths. The others differ in
 /// arithmetic alone, which golden frames cover.
-const IN_MATRIX: usize = 8;
+const IN_MATRIX: usize = 9;
 
 /// A lattice that is not cubic: the case's name, the lattice's steps, and the change of quality.
 type Leaning = (&'static str, [[f64; 3]; 3], Tweak);
 
-/// Spheres whose kernels lean: with three oblique steps, where rows lean as well, and with thick
-/// slices.
-const LEANING: [Leaning; 2] = [
+/// Spheres whose kernels lean: with three oblique steps, where rows lean as well, in both orders of
+/// classification, and with thick slices.
+const LEANING: [Leaning; 3] = [
     ("spheres/auto/oblique", [[1.1, 0.0, 0.1], [0.5, 1.3, 0.0], [-0.4, 0.6, 1.9]], |_| {}),
+    ("spheres/after/oblique", [[1.1, 0.0, 0.1], [0.5, 1.3, 0.0], [-0.4, 0.6, 1.9]], after),
     ("spheres/auto/slices", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.8]], |q| {
         q.sums = Sums::I16;
     }),
@@ -107,8 +114,10 @@ pub(crate) fn golden_cases(sample: &Path) -> Result<Vec<Case>, Fail> {
     const SIZE: [u32; 2] = [256, 208];
     let volume = Arc::new(volume::open(sample)?);
     let mut cases = Vec::new();
-    let looks: [(&str, &str, Tweak); 4] = [
+    let looks: [(&str, &str, Tweak); 6] = [
         ("auto", "auto", |_| {}),
+        ("peer-opaque/after", "peer-opaque", after),
+        ("peer-semi/after", "peer-semi", after),
         ("grey", "grey", |_| {}),
         ("peer-opaque", "peer-opaque", |_| {}),
         ("peer-opaque/paper", "peer-opaque", |q| q.compositing = Compositing::Paper),
@@ -157,7 +166,7 @@ impl Case {
                 None => presets::by_name(tf, &info.summary).map_err(|e| Fail::flag(&e))?,
             },
         };
-        let mut quality = Quality::default();
+        let mut quality = Quality::before();
         tweak(&mut quality);
         Ok(Case { name, volume, info, transfer, quality, size })
     }

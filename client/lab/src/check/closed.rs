@@ -44,7 +44,7 @@ pub(crate) fn cases() -> Vec<Case> {
 
 /// The default quality's kernel.
 fn profile() -> Profile {
-    let q = Quality::default();
+    let q = Quality::before();
     Profile::new(q.std, q.radius)
 }
 
@@ -193,7 +193,7 @@ fn rows(
 fn wall(alpha: f64, scale: f64) -> Case {
     Case::new(format!("wall of alpha {alpha}, {scale} pixels a voxel"), move |tools| {
         let tf = look(OpacityUnit::AlphaPerVox, vec![[0.0, 0.25, 0.5, 1.0]], vec![[0.0, alpha]]);
-        let shot = shot("formula:full:12x7x12", tf, Quality::default(), [0.0, 1.0, 0.0], scale)?;
+        let shot = shot("formula:full:12x7x12", tf, Quality::before(), [0.0, 1.0, 0.0], scale)?;
         let ready = shot.ready()?;
         let picture = ready.picture(Cut::on(tools.threads));
         let layer = Layer { sigma: sigma(alpha), rgb: [0.25, 0.5, 1.0] };
@@ -212,7 +212,7 @@ fn two_walls(front: f64, back: f64) -> Case {
             vec![[100.0, 1.0, 0.0, 0.0], [101.0, 0.0, 0.0, 1.0]],
             vec![[99.0, 0.0], [100.0, front], [101.0, back]],
         );
-        let shot = shot("formula:two-walls:48", tf, Quality::default(), [0.0, 1.0, 0.0], 4.0)?;
+        let shot = shot("formula:two-walls:48", tf, Quality::before(), [0.0, 1.0, 0.0], 4.0)?;
         let ready = shot.ready()?;
         let picture = ready.picture(Cut::on(tools.threads));
         // What the formula says, read along its middle, from the eye's side.
@@ -273,7 +273,7 @@ fn along_x(
                 opacities.clone(),
             );
             tf.domain = Domain::Unit;
-            let quality = Quality { compositing, thickness, ..Quality::default() };
+            let quality = Quality { compositing, thickness, ..Quality::before() };
             let shot = shot("formula:ramp:24x9x9", tf, quality, [1.0, 0.0, 0.0], 4.0)?;
             let ready = shot.ready()?;
             let picture = ready.picture(Cut::on(tools.threads));
@@ -309,7 +309,7 @@ fn bell(axis: bool) -> Case {
         );
         let to_eye = if axis { [0.0, 1.0, 0.0] } else { [0.53, 0.71, 0.36] };
         let scale = 3.0;
-        let shot = shot("formula:bell:36", tf, Quality::default(), to_eye, scale)?;
+        let shot = shot("formula:bell:36", tf, Quality::before(), to_eye, scale)?;
         let ready = shot.ready()?;
         let picture = ready.picture(Cut::on(tools.threads));
         let blob =
@@ -339,7 +339,7 @@ fn extinction(e: i32) -> Case {
     Case::new(format!("extinction 1e{e}"), move |tools| {
         let sigma = libm::pow(10.0, f64::from(e));
         let tf = look(OpacityUnit::Extinction, vec![[0.0, 0.25, 0.5, 1.0]], vec![[0.0, sigma]]);
-        let shot = shot("formula:full:8", tf, Quality::default(), [0.0, 1.0, 0.0], 4.0)?;
+        let shot = shot("formula:full:8", tf, Quality::before(), [0.0, 1.0, 0.0], 4.0)?;
         let ready = shot.ready()?;
         let picture = ready.picture(Cut::on(tools.threads));
         let layer = Layer { sigma, rgb: [0.25, 0.5, 1.0] };
@@ -353,7 +353,7 @@ fn extinction(e: i32) -> Case {
 fn layers() -> Case {
     Case::new("10^4 layers of alpha 1e-6", |tools| {
         let tf = look(OpacityUnit::AlphaPerVox, vec![[0.0, 1.0, 1.0, 1.0]], vec![[0.0, 1e-6]]);
-        let shot = shot("formula:full:2x10000x2", tf, Quality::default(), [0.0, 1.0, 0.0], 4.0)?;
+        let shot = shot("formula:full:2x10000x2", tf, Quality::before(), [0.0, 1.0, 0.0], 4.0)?;
         let ready = shot.ready()?;
         let picture = ready.picture(Cut::on(tools.threads));
         let layer = Layer { sigma: sigma(1e-6), rgb: [1.0; 3] };

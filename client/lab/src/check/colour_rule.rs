@@ -92,7 +92,7 @@ struct Line {
 /// Runs the command.
 pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
     let request = args.of.scene.request(Work::default())?;
-    let given = Quality::default();
+    let given = Quality::before();
     for (flag, given) in [
         ("thickness", request.quality.thickness != given.thickness),
         ("compositing", request.quality.compositing != given.compositing),

@@ -216,7 +216,7 @@ fn opacity(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
     let raises = [|a: f64| 1.01 * a, |a: f64| 2.0 * a, |a: f64| a * (1.25 - 0.25 * a.min(1.0))];
     let most = if case.scene == Scene::Stiff { f64::INFINITY } else { 1.0 };
     let mut rows = Vec::new();
-    for eps in [0.0, Quality::default().eps] {
+    for eps in [0.0, Quality::before().eps] {
         let mut lost = 0.0f64;
         for (mut shot, _) in case.views()? {
             shot.quality.eps = eps;

@@ -84,7 +84,7 @@ impl Scene {
             transfer.shading.on = false;
         }
         let view = view(&volume.lattice, [0.0, 2.0, 0.0], Ortho);
-        let (volume, quality) = (Arc::new(volume), Quality::default());
+        let (volume, quality) = (Arc::new(volume), Quality::before());
         Ok(Shot { volume, transfer, quality, size: effort.size, view })
     }
 }

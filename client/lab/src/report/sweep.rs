@@ -108,8 +108,8 @@ fn list(
     for eps in EPSES {
         put(Group::Eps, quality(Quality { eps, ..b }));
     }
-    for kernel in [Kernel::Bspline, Kernel::Tent] {
-        let gauss = Quality::default();
+    for kernel in [Kernel::Gaussian, Kernel::Bspline, Kernel::Tent] {
+        let gauss = Quality::before();
         put(Group::Kernel, quality(Quality { kernel, std: gauss.std, radius: gauss.radius, ..b }));
     }
     if b.kernel == Kernel::Gaussian {
@@ -169,7 +169,7 @@ mod tests {
 
     #[test]
     fn each_setting_is_tried_once_and_may_be_drawn() {
-        let base = Setting::asked(Quality::default());
+        let base = Setting::asked(Quality::before());
         let all = list(base, [512, 512], 4, true, &[]);
         assert!(all.len() > 60, "{}", all.len());
         assert_eq!(all[0].setting, base);
@@ -204,12 +204,12 @@ mod tests {
 
     #[test]
     fn what_is_not_wanted_or_not_there_is_left_out() {
-        let base = Setting::asked(Quality::default());
+        let base = Setting::asked(Quality::before());
         let few = list(base, [511, 512], 1, false, &[Group::Size, Group::Shading]);
         assert_eq!(few.len(), 1, "odd pictures are not halved, and there is no light: {few:?}");
         let eps = list(base, [512, 512], 1, true, &[Group::Eps]);
         assert!(eps[1..].iter().all(|t| t.group == Group::Eps) && eps.len() == 8);
-        let tent = Quality { kernel: Kernel::Tent, ..Quality::default() };
+        let tent = Quality { kernel: Kernel::Tent, ..Quality::before() };
         let all = list(Setting::asked(tent), [512, 512], 1, true, &[]);
         assert!(all.iter().all(
             |t| t.setting.quality.kernel != Kernel::Tent || t.setting.quality.sums != Sums::I16

@@ -162,24 +162,26 @@ pub struct PictureArgs {
 #[derive(clap::Args, Clone, Debug)]
 #[command(next_help_heading = "Quality (part of the pixels)")]
 pub struct QualityArgs {
-    /// Thickness of a sheet in vox (smallest sample spacing)
-    #[arg(long, value_name = "VOX", default_value = "1.0", value_parser = parse::number,
+    /// Thickness of a sheet in vox (smallest sample spacing) [default: 2/3]
+    ///
+    /// With `--classify before` the default is 1.
+    #[arg(long, value_name = "VOX", value_parser = parse::fraction,
           allow_negative_numbers = true)]
-    thickness: f64,
+    thickness: Option<f64>,
     /// Transmittance below which a pixel is shut
     ///
     /// 0 shuts no pixel.
     #[arg(long, value_name = "E", default_value = "1/512", value_parser = parse::fraction,
           allow_negative_numbers = true, hide_short_help = true)]
     eps: f64,
-    /// Reconstruction kernel: gaussian, bspline or tent
+    /// Reconstruction kernel: bspline, gaussian or tent [default: bspline]
     ///
-    /// B-splines add up to one along the lattice's axes; the tent ripples by up to 39 % from other
-    /// sides.
-    #[arg(long, default_value = "gaussian", value_name = "KERNEL", hide_short_help = true,
+    /// With `--classify before` the default is gaussian. B-splines add up to one along the
+    /// lattice's axes; the tent ripples by up to 39 % from other sides.
+    #[arg(long, value_name = "KERNEL", hide_short_help = true,
           value_parser = words(&[("gaussian", Kernel::Gaussian), ("bspline", Kernel::Bspline),
                                  ("tent", Kernel::Tent)]))]
-    kernel: Kernel,
+    kernel: Option<Kernel>,
     /// Standard deviation of the Gaussian kernel, in lattice steps: 0.5 sharp, 0.7 smooth
     #[arg(long, value_name = "STEPS", default_value = "0.6", value_parser = parse::number,
           allow_negative_numbers = true, hide_short_help = true)]
@@ -191,7 +193,7 @@ pub struct QualityArgs {
     /// Classify values after or before the kernel reconstructs them
     ///
     /// `after` gives sharp surfaces; `before` blurs classified voxels, as in the paper.
-    #[arg(long, default_value = "before", value_name = "ORDER", hide_short_help = true,
+    #[arg(long, default_value = "after", value_name = "ORDER", hide_short_help = true,
           value_parser = words(&[("after", Classify::After), ("before", Classify::Before)]))]
     classify: Classify,
     /// How sheets are composited
@@ -224,10 +226,11 @@ pub struct QualityArgs {
 
 impl QualityArgs {
     fn quality(&self) -> Result<Quality, Fail> {
+        let default = Quality::of(self.classify);
         let q = Quality {
-            thickness: self.thickness,
+            thickness: self.thickness.unwrap_or(default.thickness),
             eps: self.eps,
-            kernel: self.kernel,
+            kernel: self.kernel.unwrap_or(default.kernel),
             std: self.std,
             radius: self.radius,
             classify: self.classify,
@@ -235,7 +238,7 @@ impl QualityArgs {
             splat: self.splat,
             sums: self.sums,
             cull: self.cull,
-            ..Quality::default()
+            ..default
         };
         q.check().map_err(|e| Fail::flag(&e))?;
         Ok(q)

@@ -40,7 +40,7 @@ fn defaults_are_those_of_the_contract() {
     ] {
         assert_eq!(asked(line).unwrap().path.fit, fit, "{line}");
     }
-    assert_eq!((a.quality, a.work), (Quality::default(), Work::default()));
+    assert_eq!((a.quality, a.work), (Quality::before(), Work::default()));
     let message = a.to_message(&cube(), PixelFormat::Rgb8, false);
     assert_eq!(message.transfer, TransferChoice::Name("auto".into()));
     assert_eq!(message.background, Background::Colour([0.0; 3]));

@@ -190,7 +190,7 @@ mod tests {
             target: [0.0; 3].into(),
             projection,
         };
-        View::new(&lattice, &camera, SIZE, &Quality::default()).expect("a view")
+        View::new(&lattice, &camera, SIZE, &Quality::before()).expect("a view")
     }
 
     type Lists = BTreeSet<(WorkerId, u32)>;

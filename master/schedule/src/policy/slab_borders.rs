@@ -250,6 +250,6 @@ mod tests {
             target: [0.0; 3].into(),
             projection: CameraProjection::Ortho { height: 20.0 },
         };
-        View::new(&lattice, &camera, [100, 70], &Quality::default()).expect("a view")
+        View::new(&lattice, &camera, [100, 70], &Quality::before()).expect("a view")
     }
 }

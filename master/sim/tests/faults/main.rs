@@ -89,7 +89,7 @@ fn chaos(seed: u64, schedules: Schedules) -> World {
             thickness: rng.pick(&[1.0, 2.0, 4.0]),
             eps: rng.pick(&[0.0, 1.0 / 512.0, 0.05, 0.3]),
             cull: !rng.one_in(4),
-            ..Quality::default()
+            ..Quality::before()
         };
         let scene = pattern::scene(frame, *set, dims, quality);
         let work = Work {
@@ -169,7 +169,7 @@ fn chaos_alone(seed: u64) -> World {
     let quality = Quality {
         thickness: rng.pick(&[2.0, 4.0]),
         eps: rng.pick(&[0.0, 1.0 / 512.0, 0.3]),
-        ..Quality::default()
+        ..Quality::before()
     };
     let scene = pattern::scene(0, set, dims, quality);
     let work = Work { schedule: Schedule::Region, ..Work::default() };
@@ -247,7 +247,7 @@ fn chaos_crowd(seed: u64) -> (World, usize) {
     let dims = [rng.between(8, 24) as u32, rng.between(8, 24) as u32, rng.between(8, 16) as u32];
     let (set, bricks) = (pattern::key(0), pattern::bricks(&mut rng, dims, 6));
     let size = [rng.between(40, 140) as u32, rng.between(40, 140) as u32];
-    let quality = Quality { thickness: 4.0, ..Quality::default() };
+    let quality = Quality { thickness: 4.0, ..Quality::before() };
     let scene = pattern::scene(0, set, dims, quality);
     let work = Work { schedule: Schedule::Region, ..Work::default() };
     let small_budgets = rng.one_in(4);

@@ -34,7 +34,7 @@ fn statistics_of_a_frame_worked_out_by_hand() {
     };
     s.handle(&clock, joined);
     let work = Work { tile: Some(256), slabs: 2, ..slab() };
-    let job = job_with(3, work, Quality { thickness: 2.0, eps: 0.0, ..Quality::default() });
+    let job = job_with(3, work, Quality { thickness: 2.0, eps: 0.0, ..Quality::before() });
     let projections = pattern::projections(&job);
     s.handle(&clock, Event::FrameQueued(job.clone()));
     let (mut done, mut sent, mut results) = (None, 0, 0);

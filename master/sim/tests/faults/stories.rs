@@ -35,7 +35,7 @@ fn job(frame: u64) -> Box<FrameJob> {
 
 fn job_by(frame: u64, schedule: Schedule) -> Box<FrameJob> {
     let work = Work { tile: Some(32), schedule, ..slab() };
-    job_with(frame, work, Quality { thickness: 2.0, ..Quality::default() })
+    job_with(frame, work, Quality { thickness: 2.0, ..Quality::before() })
 }
 
 fn world() -> World {
@@ -60,7 +60,7 @@ fn leases(w: &World) -> Vec<u32> {
 
 #[test]
 fn picture_bytes_do_not_depend_on_workers_tiles_slabs_or_culling() {
-    let quality = Quality { thickness: 2.0, eps: 0.2, ..Quality::default() };
+    let quality = Quality { thickness: 2.0, eps: 0.2, ..Quality::before() };
     let want = pattern::serial(&job_with(0, slab(), quality)).sha256();
     for n in [1, 3, 7] {
         for tile in [None, Some(16), Some(128), Some(256)] {
@@ -188,7 +188,7 @@ fn a_deadly_tile(schedule: Schedule) {
         w.add_worker(deadly.clone());
     }
     let work = Work { tile: Some(32), slabs: 1, schedule, ..slab() };
-    w.add_frame(job_with(0, work, Quality { thickness: 2.0, ..Quality::default() }));
+    w.add_frame(job_with(0, work, Quality { thickness: 2.0, ..Quality::before() }));
     w.until(|w| w.scheduler().is_idle());
     let done = &w.observer.done[&FrameId(0)];
     let poisoned = &done.stats.poisoned;
@@ -198,8 +198,7 @@ fn a_deadly_tile(schedule: Schedule) {
     assert_eq!(w.scheduler().totals().lost_workers, 3);
     let reason = done.spans.iter().flat_map(|s| &s.args).find(|a| a.0 == "reason");
     assert_eq!(reason.expect("a reason").1, "3 workers were lost with it");
-    let want =
-        pattern::serial(&job_with(0, work, Quality { thickness: 2.0, ..Quality::default() }));
+    let want = pattern::serial(&job_with(0, work, Quality { thickness: 2.0, ..Quality::before() }));
     for (i, (got, want)) in
         done.picture.as_ref().expect("sums").pixels.iter().zip(&want.pixels).enumerate()
     {
@@ -217,7 +216,7 @@ fn killed_workers_leave_the_same_bytes_and_no_poisoned_tile() {
         workers(&mut w, 8);
         let schedule = BOTH[seed as usize % 2];
         let work = Work { tile: Some(16), schedule, ..slab() };
-        w.add_frame(job_with(0, work, Quality { thickness: 2.0, ..Quality::default() }));
+        w.add_frame(job_with(0, work, Quality { thickness: 2.0, ..Quality::before() }));
         let kills = rng.pick(&[1, 4, 7]);
         for id in 1..=kills {
             let when = 1_000 + rng.below(25_000);
@@ -274,7 +273,7 @@ fn lease_expires_and_goes_to_another_worker() {
     });
     workers(&mut w, 1);
     let work = Work { tile: Some(256), slabs: 1, ..slab() };
-    w.add_frame(job_with(0, work, Quality::default()));
+    w.add_frame(job_with(0, work, Quality::before()));
     let time = time(&mut w);
     assert!((60_000_000..61_500_000).contains(&time), "{time} us");
     assert_eq!(w.observer.done[&FrameId(0)].stats.retries, 1);
@@ -292,7 +291,7 @@ fn straggler_delays_a_frame_by_less_than_a_third() {
             w.add_worker(WorkerProfile { time_factor: 5.0, ..typical() });
         }
         let work = Work { tile, schedule, ..slab() };
-        w.add_frame(job_with(0, work, Quality { thickness: 1.0, ..Quality::default() }));
+        w.add_frame(job_with(0, work, Quality { thickness: 1.0, ..Quality::before() }));
         let time = time(&mut w);
         w.finish();
         let stats = &w.observer.done[&FrameId(0)].stats;
@@ -473,7 +472,7 @@ fn frames_of_a_path_overlap_and_end_in_order() {
 /// Draws frames of one view, one at a time, in which nothing hides anything. Returns how long each
 /// took, in microseconds.
 fn one_by_one(w: &mut World, frames: std::ops::Range<u64>, work: Work) -> Vec<Micros> {
-    let quality = Quality { thickness: 1.0, eps: 0.0, ..Quality::default() };
+    let quality = Quality { thickness: 1.0, eps: 0.0, ..Quality::before() };
     let scene = pattern::scene(0, pattern::key(0), DIMS, quality);
     let took = frames.map(|frame| {
         let mut job = pattern::job(&mut Rng::new(5), 0, &scene, &bricks(), [256, 256], work);
@@ -495,7 +494,7 @@ fn sole_worker_is_lent_all_short_tiles_at_once() {
         let work = Work { tile: Some(64), schedule: Schedule::Region, ..slab() };
         one_by_one(&mut w, 0..2, work);
         let before = w.observer.audit.leases_given;
-        let quality = Quality { thickness: 1.0, eps: 0.0, ..Quality::default() };
+        let quality = Quality { thickness: 1.0, eps: 0.0, ..Quality::before() };
         let scene = pattern::scene(0, pattern::key(0), DIMS, quality);
         let mut job = pattern::job(&mut Rng::new(5), 0, &scene, &bricks(), [256, 256], work);
         (job.frame, job.number) = (FrameId(2), 2);
@@ -633,7 +632,7 @@ fn overlapping_frames_keep_the_tile_owners_of_the_first() {
     for frame in 0..4 {
         // The same view again and again.
         let work = Work { tile: Some(16), schedule: Schedule::Region, ..slab() };
-        let quality = Quality { thickness: 1.0, ..Quality::default() };
+        let quality = Quality { thickness: 1.0, ..Quality::before() };
         let mut job = job_with(0, work, quality);
         (job.frame, job.number) = (FrameId(frame), frame);
         w.add_frame(job);
@@ -660,7 +659,7 @@ fn workers_get_shares_of_a_path_by_their_speed() {
         }
         let work = Work { tile: Some(16), schedule: Schedule::Region, ..slab() };
         for frame in 0..80 {
-            let quality = Quality { thickness: 1.0, ..Quality::default() };
+            let quality = Quality { thickness: 1.0, ..Quality::before() };
             w.add_frame(job_with(frame, work, quality));
         }
         w.until(|w| w.observer.done.len() >= 8);
@@ -776,7 +775,7 @@ fn memory_budget_of_a_slab_worker_holds_the_bricks_of_its_leases() {
     w.add_worker(WorkerProfile { threads: 2, memory_budget_bytes: all * 2 / 3, ..typical() });
     let work = Work { tile: Some(32), slabs: 1, ..slab() };
     for frame in 0..4 {
-        w.add_frame(job_with(frame, work, Quality { thickness: 2.0, ..Quality::default() }));
+        w.add_frame(job_with(frame, work, Quality { thickness: 2.0, ..Quality::before() }));
     }
     w.finish();
     assert_eq!(w.scheduler().totals().over_budget, 0);

@@ -18,7 +18,7 @@ use slabcast_common::ids::{FrameId, SceneId};
 use slabcast_common::image::PixelEncoding;
 use slabcast_common::kernel::Lean;
 use slabcast_common::message::{SceneSpec, ToWorker};
-use slabcast_common::quality::Sums;
+use slabcast_common::quality::{Classify, Sums};
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::{Lattice, VolumeInfo};
 
@@ -99,8 +99,8 @@ pub fn scene_from_wire(scene: wire::Scene) -> Result<SceneSpec, WireError> {
         volume_from_wire(required("volume", scene.volume)?).map_err(|e| e.within("volume"))?;
     let transfer = transfer_from_wire(required("transfer", scene.transfer)?)
         .map_err(|e| e.within("transfer"))?;
-    let quality =
-        quality_from_wire(required("quality", scene.quality)?).map_err(|e| e.within("quality"))?;
+    let quality = quality_from_wire(required("quality", scene.quality)?, Classify::Before)
+        .map_err(|e| e.within("quality"))?;
     if quality.sums == Sums::Auto {
         return Err(WireError::value("quality.sums", "is undecided; a scene says which sums"));
     }

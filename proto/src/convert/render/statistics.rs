@@ -9,6 +9,7 @@ use super::submit::{schedule_from_wire, schedule_to_wire};
 use super::wire;
 use crate::convert::{WireError, required};
 use prost::Message;
+use slabcast_common::quality::Classify;
 use slabcast_common::stats::{
     Bound, BoundAndEstimate, BrickStats, ErrorStats, Estimate, FrameMs, FrameStats, LeftOut,
     PoisonedTile, SlabStats, TileStats, VoxelStats, WorkerStats,
@@ -207,7 +208,7 @@ fn statistics_from_wire(s: wire::FrameStatistics) -> Result<FrameStats, WireErro
         },
         result_bytes: s.result_bytes,
         slabs: slabs.collect(),
-        quality: quality_from_wire(required("quality", s.quality)?)
+        quality: quality_from_wire(required("quality", s.quality)?, Classify::Before)
             .map_err(|e| e.within("quality"))?,
         left_out: s
             .left_out

@@ -8,6 +8,7 @@ use super::shared::{
 use super::{enum_conversions, wire};
 use crate::convert::{WireError, name_from_wire, required};
 use slabcast_common::image::PixelFormat;
+use slabcast_common::quality::Classify;
 use slabcast_common::quality::{Borders, Keep, Schedule, Work};
 use slabcast_scene::request::PathRequest;
 use slabcast_scene::transfer::TransferChoice;
@@ -60,7 +61,7 @@ pub fn submit_from_wire(request: wire::SubmitPathRequest) -> Result<PathRequest,
         transfer: choice_from_wire(request.transfer.unwrap_or_default())
             .map_err(|e| e.within("transfer"))?
             .unwrap_or_else(|| TransferChoice::Name("auto".into())),
-        quality: quality_from_wire(request.quality.unwrap_or_default())
+        quality: quality_from_wire(request.quality.unwrap_or_default(), Classify::After)
             .map_err(|e| e.within("quality"))?,
         work: work_from_wire(request.work.unwrap_or_default()).map_err(|e| e.within("work"))?,
         format: wanted_format_from_wire("format", request.format)?,

@@ -66,7 +66,7 @@ fn homogeneous_block_has_the_opacity_of_its_optical_depth() {
     for alpha in [1e-6, 0.02, 0.3, 0.999] {
         let tf = alphas(vec![[0.0, 0.25, 0.5, 1.0]], vec![[0.0, alpha]]);
         for thickness in [0.25, 1.0, 2.7] {
-            let q = Quality { thickness, ..Quality::default() };
+            let q = Quality { thickness, ..Quality::before() };
             let p = picture(&volume, tf.clone(), q, None);
             let sigma = -libm::log1p(-alpha);
             for y in 0..p.size[1] {
@@ -107,7 +107,7 @@ fn front_wall_attenuates_back_wall_by_its_opacity() {
         );
         let sigma = |a: f64| (-libm::log1p(-a)).min(16.0 * std::f64::consts::LN_2);
         for compositing in [Compositing::Linear, Compositing::Constant] {
-            let q = Quality { compositing, ..Quality::default() };
+            let q = Quality { compositing, ..Quality::before() };
             let p = picture(&volume, tf.clone(), q, None);
             for y in 0..p.size[1] {
                 for x in 0..p.size[0] {
@@ -155,7 +155,7 @@ fn colour_ramp_is_the_emission_absorption_integral() {
         transmittance *= (-tau).exp();
     }
     let error = |compositing, thickness| {
-        let q = Quality { compositing, thickness, ..Quality::default() };
+        let q = Quality { compositing, thickness, ..Quality::before() };
         let p = picture(&volume, tf.clone(), q, None);
         let (x, y) = (p.size[0] / 2 - 1, p.size[1] / 2 - 1);
         let (i, k) = looks_at(&volume, p.size[0], x, y);
@@ -198,7 +198,7 @@ fn pictures_are_neither_flipped_nor_mirrored() {
     );
     let projections = [None, Some(CameraProjection::Persp { fov: 30.0, distance: 80.0 })];
     for projection in projections {
-        let p = picture(&volume, tf.clone(), Quality::default(), projection);
+        let p = picture(&volume, tf.clone(), Quality::before(), projection);
         let n = p.size[0] as usize;
         let centroid = |c: usize| {
             let (mut w, mut x, mut y) = (0.0, 0.0, 0.0);

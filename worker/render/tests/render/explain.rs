@@ -8,7 +8,7 @@ use slabcast_common::quality::{Classify, Compositing, Kernel, Quality, Sums};
 use slabcast_common::shade::Shading;
 use slabcast_common::transfer::{OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
-use slabcast_common::volume::{Digest32, Volume};
+use slabcast_common::volume::{Digest32, Samples, Volume};
 use slabcast_render::judge::reference::FieldReference;
 use slabcast_render::oracle::explain::{PixelExplanation, explain};
 use slabcast_render::oracle::explain_field::explain_field;
@@ -78,7 +78,7 @@ fn qualities() -> Vec<Quality> {
     for compositing in [Compositing::Linear, Compositing::Constant, Compositing::Paper] {
         for sums in [Sums::I32, Sums::I16, Sums::F32] {
             for (thickness, eps) in [(1.0, 1.0 / 512.0), (0.3, 0.0), (2.5, 0.1)] {
-                out.push(Quality { compositing, sums, thickness, eps, ..Quality::default() });
+                out.push(Quality { compositing, sums, thickness, eps, ..Quality::before() });
             }
         }
     }
@@ -111,7 +111,11 @@ fn explained_pixel_equals_rendered_pixel_bit_for_bit() {
 /// A field's pixel is explained with the renderer's numbers, and with values near the exact ones.
 #[test]
 fn explained_field_equals_rendered_pixel_bit_for_bit() {
-    let volume = onion();
+    // No voxel is 0: `bricks_of` leaves those out.
+    let mut volume = onion();
+    if let Samples::U8(samples) = &mut volume.samples {
+        samples.iter_mut().for_each(|v| *v = (*v).max(1));
+    }
     let bricks = bricks_of(&volume);
     for (sums, thickness) in [(Sums::I32, 0.5), (Sums::I16, 1.0)] {
         for projection in PROJECTIONS {
@@ -120,7 +124,7 @@ fn explained_field_equals_rendered_pixel_bit_for_bit() {
                 kernel: Kernel::Bspline,
                 sums,
                 thickness,
-                ..Quality::default()
+                ..Quality::before()
             };
             let frame = frame(&volume, quality, projection);
             let (picture, notes) = count_work(&frame, &bricks);
@@ -141,19 +145,20 @@ fn explained_field_equals_rendered_pixel_bit_for_bit() {
                 );
                 for plane in &e.planes {
                     let exact = reference.value_on_ray([x, y], plane.depth);
-                    // Outside the box a kernel's weight is small, and what is divided by it coarse.
-                    if plane.voxels > 40 {
+                    // Fewer voxels: at the volume's faces, or terms that 16 bits round to nothing.
+                    if plane.voxels > 60 {
                         deep += 1;
-                        assert!((plane.code - exact).abs() < 1.5, "{what}: {plane:?}, {exact}");
+                        assert!((plane.code - exact).abs() < 0.5, "{what}: {plane:?}, {exact}");
                     }
                     assert!(plane.strongest.len() == plane.voxels.min(3), "{what}");
                     let terms: f64 = plane.strongest.iter().map(|v| v.adds).sum();
-                    assert!(terms <= plane.code.abs() + 1.0 || plane.voxels < 40, "{what}");
+                    assert!(terms <= plane.code.abs() + 1.0 || plane.voxels < 60, "{what}");
                 }
                 seen += usize::from(e.pixel[3] > 0.0);
                 shut += usize::from(e.shut_in.is_some());
             }
-            assert!(seen > 10 && shut > 3 && deep > 20, "{seen} seen, {shut} shut, {deep} deep");
+            let enough = deep > 20 || sums == Sums::I16;
+            assert!(seen > 10 && shut > 3 && enough, "{seen} seen, {shut} shut, {deep} deep");
         }
     }
 }
@@ -163,7 +168,7 @@ fn work_counters_match_explained_sheets_and_sections() {
     let volume = onion();
     let bricks = bricks_of(&volume);
     for (sums, projection) in [(Sums::I32, PROJECTIONS[0]), (Sums::F32, PROJECTIONS[1])] {
-        let quality = Quality { sums, ..Quality::default() };
+        let quality = Quality { sums, ..Quality::before() };
         let frame = frame(&volume, quality, projection);
         let (picture, notes) = count_work(&frame, &bricks);
         assert_eq!(picture, serial::render(&frame, &bricks));
@@ -220,7 +225,7 @@ fn agrees_with_itself(e: &PixelExplanation, quality: &Quality, what: &str) {
 fn explained_sections_sum_to_their_sheet() {
     let volume = onion();
     let bricks = bricks_of(&volume);
-    let quality = Quality { sums: Sums::I32, ..Quality::default() };
+    let quality = Quality { sums: Sums::I32, ..Quality::before() };
     for projection in PROJECTIONS {
         let frame = frame(&volume, quality, projection);
         let e = explain(&frame, &bricks, [SIZE / 2, SIZE / 2], usize::MAX);

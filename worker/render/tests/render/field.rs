@@ -5,7 +5,7 @@ use glam::DVec3;
 use slabcast_common::crop::CropBox;
 use slabcast_common::ids::SceneId;
 use slabcast_common::message::SceneSpec;
-use slabcast_common::quality::{Classify, Kernel, Quality, Sums};
+use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::transfer::OpacityUnit;
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
@@ -34,14 +34,7 @@ fn constant_volume_is_drawn_at_full_strength_up_to_its_faces() {
         .into_iter()
         .flat_map(|(sums, thickness)| [(sums, thickness, None), (sums, thickness, Some(cut))])
     {
-        let quality = Quality {
-            classify: Classify::After,
-            kernel: Kernel::Bspline,
-            eps: 0.0,
-            sums,
-            thickness,
-            ..Quality::default()
-        };
+        let quality = Quality { eps: 0.0, sums, thickness, ..Quality::default() };
         let spec = SceneSpec {
             id: SceneId(1),
             volume: volume.info(Digest32::default()),
@@ -107,14 +100,7 @@ fn cropped_and_modulated_pictures_approach_the_limit() {
         };
         let mut errors = Vec::new();
         for thickness in [1.0, 0.5] {
-            let quality = Quality {
-                classify: Classify::After,
-                kernel: Kernel::Bspline,
-                eps: 0.0,
-                sums: Sums::I32,
-                thickness,
-                ..Quality::default()
-            };
+            let quality = Quality { eps: 0.0, sums: Sums::I32, thickness, ..Quality::default() };
             let spec = SceneSpec {
                 id: SceneId(1),
                 volume: volume.info(Digest32::default()),

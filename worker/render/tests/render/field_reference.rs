@@ -40,7 +40,7 @@ fn judge(asked: &JudgedScene) -> FieldReference {
 }
 
 fn after(kernel: Kernel) -> Quality {
-    Quality { classify: Classify::After, kernel, ..Quality::default() }
+    Quality { classify: Classify::After, kernel, ..Quality::before() }
 }
 
 fn extinction(colors: Vec<[f64; 4]>, opacities: Vec<[f64; 2]>) -> TransferFunction {

@@ -9,7 +9,7 @@ fn profiles() -> Vec<Profile> {
     let gaussians = [(0.6, 2.0), (0.5, 2.0), (0.7, 2.0), (0.4, 1.0), (1.0, 3.0)];
     let mut all: Vec<_> = gaussians.map(|(std, r)| Profile::gaussian(std, r)).to_vec();
     for kernel in [Kernel::Bspline, Kernel::Tent] {
-        let [std, radius] = Quality { kernel, ..Quality::default() }.kernel_shape();
+        let [std, radius] = Quality { kernel, ..Quality::before() }.kernel_shape();
         all.extend([1.0, 2.5].map(|step| Profile::new(kernel, std * step, radius * step)));
     }
     all
@@ -60,7 +60,7 @@ proptest! {
         phase in 0.0..1.0f64, step in 0.1..50.0f64, tent in any::<bool>(),
     ) {
         let kernel = if tent { Kernel::Tent } else { Kernel::Bspline };
-        let [std, radius] = Quality { kernel, ..Quality::default() }.kernel_shape();
+        let [std, radius] = Quality { kernel, ..Quality::before() }.kernel_shape();
         let p = Profile::new(kernel, std * step, radius * step);
         let at = |k: i32| (f64::from(k) + phase) * step;
         let sum: f64 = (-3..=3).map(|k| p.at(at(k)) * step).sum();
@@ -75,7 +75,7 @@ proptest! {
 
 #[test]
 fn merging_slivers_moves_little_light_between_sheets() {
-    let [std, radius] = Quality::default().kernel_shape();
+    let [std, radius] = Quality::before().kernel_shape();
     let p = Profile::new(Kernel::Gaussian, std, radius);
     let given = |d: f64, most: f64| Sections::given_away(&p, d, 256, most);
     let opaque = given(1.0, 16.0 * std::f64::consts::LN_2);
@@ -91,7 +91,7 @@ fn merging_slivers_moves_little_light_between_sheets() {
 #[test]
 fn section_weights_of_a_voxel_sum_to_one() {
     let all = [Kernel::Gaussian, Kernel::Bspline, Kernel::Tent];
-    let all = all.map(|kernel| Quality { kernel, ..Quality::default() });
+    let all = all.map(|kernel| Quality { kernel, ..Quality::before() });
     let thick = [1.0 / 64.0, 0.25, 1.0, 1.7, 5.0, 300.0];
     for (q, d) in all.iter().flat_map(|q| thick.map(|d| (q, d))) {
         let [std, radius] = q.kernel_shape();

@@ -28,7 +28,7 @@ proptest! {
             Volume::from_fn_u8("any", [16; 3], |i, j, k| (i + 3 * j + 7 * k) as u8);
         volume.lattice = Lattice::from_spacing([16; 3], [1.0, wide, 1.0]);
         volume.lattice.steps[0].y = skew;
-        let quality = Quality { thickness, ..Quality::default() };
+        let quality = Quality { thickness, ..Quality::before() };
         let projection = match parallel {
             false => CameraProjection::Persp { fov, distance },
             true => CameraProjection::Ortho { height: distance },

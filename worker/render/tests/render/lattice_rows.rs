@@ -18,7 +18,7 @@ use std::sync::Arc;
 fn frame(to_eye: DVec3, up: DVec3, projection: CameraProjection, sums: Sums, z: f64) -> Frame {
     let mut volume = Volume::from_fn_u8("any", [20, 16, 24], |i, j, k| (i + 3 * j + 7 * k) as u8);
     volume.lattice = Lattice::from_spacing([20, 16, 24], [1.0, 1.0, z]);
-    let quality = Quality { sums, ..Quality::default() };
+    let quality = Quality { sums, ..Quality::before() };
     let camera = Camera { to_eye, up, target: DVec3::ZERO, projection };
     let view = View::new(&volume.lattice, &camera, [100, 90], &quality).expect("a view");
     Frame::new(Arc::new(Scene::new(&selftest::spec(&volume, quality))), view)

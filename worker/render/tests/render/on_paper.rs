@@ -101,7 +101,7 @@ fn spline_kernel_walls_stay_within_rounding_bounds() {
     for (kernel, scale) in [(Kernel::Bspline, 4.0), (Kernel::Bspline, 3.7), (Kernel::Tent, 4.0)] {
         for (sigma, thickness) in [(0.05, 1.0), (2.0, 1.0), (2.0, 0.3), (0.5, 3.5)] {
             let tf = extinctions(vec![[0.0, 1.0, 0.5, 0.25]], vec![[0.0, sigma]]);
-            let q = Quality { kernel, thickness, ..Quality::default() };
+            let q = Quality { kernel, thickness, ..Quality::before() };
             let shot = Shot::new(block(n, 6), tf, q, DVec3::Y, (n, scale));
             let scale = f64::from(shot.view.size[1]) / (f64::from(shot.view.size[1]) / scale);
             let layers = vec![Layer { sigma, rgb: [1.0, 0.5, 0.25] }; 6];
@@ -149,7 +149,7 @@ fn extinctions_from_faint_to_stiff_stay_within_rounding_bounds() {
     for e in [-9, -6, -3, 0, 3, 6, 9] {
         let sigma = libm::pow(10.0, f64::from(e));
         let tf = extinctions(vec![[0.0, 0.25, 0.5, 1.0]], vec![[0.0, sigma]]);
-        let shot = Shot::new(block(n, n), tf, Quality::default(), DVec3::Y, (n, scale));
+        let shot = Shot::new(block(n, n), tf, Quality::before(), DVec3::Y, (n, scale));
         assert_eq!(shot.spec.quality.sums == Sums::F32, sigma > 12.0);
         let layer = Layer { sigma, rgb: [0.25, 0.5, 1.0] };
         let stack = stack(n, vec![layer; n as usize]);
@@ -164,7 +164,7 @@ fn off_grid_wall_stays_within_position_rounding_bound() {
     let (n, scale) = (10, 3.7);
     for sigma in [0.05, 2.0] {
         let tf = extinctions(vec![[0.0, 1.0, 0.5, 0.25]], vec![[0.0, sigma]]);
-        let shot = Shot::new(block(n, 6), tf, Quality::default(), DVec3::Y, (n, scale));
+        let shot = Shot::new(block(n, 6), tf, Quality::before(), DVec3::Y, (n, scale));
         let scale = f64::from(shot.view.size[1]) / (f64::from(shot.view.size[1]) / scale);
         let stack = stack(n, vec![Layer { sigma, rgb: [1.0, 0.5, 0.25] }; 6]);
         let shift = 0.5 / f64::from(SUBPIXELS) / scale;
@@ -179,7 +179,7 @@ fn ten_thousand_layers_of_extinction_1e_minus_6_add_up() {
     let (n, deep, scale) = (2, 10_000, 4.0);
     let sigma = -libm::log1p(-1e-6);
     let tf = extinctions(vec![[0.0, 1.0, 1.0, 1.0]], vec![[0.0, sigma]]);
-    let shot = Shot::new(block(n, deep), tf, Quality::default(), DVec3::Y, (n, scale));
+    let shot = Shot::new(block(n, deep), tf, Quality::before(), DVec3::Y, (n, scale));
     let stack = stack(n, vec![Layer { sigma, rgb: [1.0; 3] }; deep as usize]);
     let most = judge(&shot, &shot.picture(), &stack, scale, 0.0, "layers");
     println!("{most:.3} of the bound");
@@ -191,7 +191,7 @@ fn partial_slab_has_the_optical_depth_in_front_of_its_border() {
     let (n, scale, d) = (8, 4.0, 0.7);
     let sigma = 0.3;
     let tf = extinctions(vec![[0.0, 1.0, 1.0, 1.0]], vec![[0.0, sigma]]);
-    let q = Quality { thickness: d, ..Quality::default() };
+    let q = Quality { thickness: d, ..Quality::before() };
     let shot = Shot::new(block(n, n), tf, q, DVec3::Y, (n, scale));
     let stack = stack(n, vec![Layer { sigma, rgb: [1.0; 3] }; n as usize]);
     let (frame, bricks) = (shot.frame(), bricks_of(&shot.volume));
@@ -238,7 +238,7 @@ fn gaussian_blob_renders_its_line_integrals() {
     let blob = GaussianBlob { profile: profile(), peak, std: wide, voxels: n };
     for (to_eye, axis) in [(DVec3::Y, true), (DVec3::new(0.53, 0.71, 0.36), false)] {
         let tf = extinctions(vec![[0.0, 1.0, 0.5, 0.25]], vec![[0.0, 0.0], [1.0, peak]]);
-        let shot = Shot::new(volume.clone(), tf, Quality::default(), to_eye, (n, scale));
+        let shot = Shot::new(volume.clone(), tf, Quality::before(), to_eye, (n, scale));
         let picture = shot.picture();
         let shift = 0.5 / f64::from(SUBPIXELS) / scale;
         let how = shot.rounding(shift);
@@ -278,7 +278,7 @@ fn pictures_converge_with_sheet_thickness_at_the_order_of_the_colour_rule() {
     let error = |compositing, thickness| {
         let tf =
             extinctions(vec![[10.0, 0.0, 1.0, 0.5], [200.0, 1.0, 0.0, 0.5]], vec![[0.0, sigma]]);
-        let q = Quality { compositing, thickness, ..Quality::default() };
+        let q = Quality { compositing, thickness, ..Quality::before() };
         let shot = Shot::new(volume.clone(), tf, q, DVec3::Y, (n, scale));
         let picture = shot.picture();
         let w = shot.view.size[0];

@@ -229,7 +229,7 @@ proptest! {
         v.lattice = Lattice::from_spacing(v.lattice.dims, [1.0, spacing, 1.0]);
         v.lattice.steps[0].y = skew;
         let quality =
-            Quality { thickness, eps, classify, compositing, sums, kernel, ..Quality::default() };
+            Quality { thickness, eps, classify, compositing, sums, kernel, ..Quality::before() };
         let camera = Camera {
             to_eye: DVec3::new(azimuth.sin(), azimuth.cos(), tilt),
             up,
@@ -325,7 +325,7 @@ fn nan_infinite_and_huge_samples_give_finite_pixels() {
     tf.domain = Domain::Unit;
     tf.opacities = vec![[0.0, 0.3], [1.0, 1.0]];
     tf.nan.opacity = 0.2;
-    let quality = Quality { sums: Sums::I32, ..Quality::default() };
+    let quality = Quality { sums: Sums::I32, ..Quality::before() };
     let spec = SceneSpec {
         id: SceneId(1),
         volume: v.info(Digest32::default()),

@@ -64,7 +64,7 @@ impl JudgedScene {
 }
 
 pub(crate) fn i32_sums() -> Quality {
-    Quality { sums: Sums::I32, ..Quality::default() }
+    Quality { sums: Sums::I32, ..Quality::before() }
 }
 
 /// From +y (x to the left, z up), 4 pixels a voxel.
@@ -446,7 +446,7 @@ fn reference_handles_extinctions_from_faint_to_stiff() {
             vec![[0.0, sigma]],
             OpacityUnit::Extinction,
         );
-        let q = Quality { sums: Sums::F32, ..Quality::default() };
+        let q = Quality { sums: Sums::F32, ..Quality::before() };
         let asked = JudgedScene::new(volume.clone(), tf, q, camera, size);
         let reference = asked.reference();
         for (x, y) in (0..size * size).step_by(37).map(|i| (i % size, i / size)) {

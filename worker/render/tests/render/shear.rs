@@ -22,7 +22,7 @@ fn frame(sums: Sums, odd: f64, eye: [[f64; 3]; 2], height: f64) -> Frame {
     let dims = [20, 16, 24];
     let mut volume = Volume::from_fn_u8("any", dims, |i, j, k| (i + 3 * j + 7 * k) as u8);
     volume.lattice = Lattice::from_spacing(dims, [1.0, 1.0, odd]);
-    let quality = Quality { sums, ..Quality::default() };
+    let quality = Quality { sums, ..Quality::before() };
     let projection = CameraProjection::Ortho { height };
     let [to_eye, up] = eye.map(DVec3::from_array);
     let camera = Camera { to_eye, up, target: DVec3::ZERO, projection };

@@ -19,7 +19,7 @@ fn footprint_cost_counts_pixels_and_bytes() {
     let flat = CameraProjection::Ortho { height: 40.0 };
     let deep = CameraProjection::Persp { fov: 30.0, distance: 60.0 };
     let adds_from = |up, sums, thickness, projection| {
-        let quality = Quality { sums, thickness, ..Quality::default() };
+        let quality = Quality { sums, thickness, ..Quality::before() };
         let to_eye = DVec3::new(1.0, 2.0, up);
         let camera = Camera { to_eye, up: DVec3::Z, target: DVec3::ZERO, projection };
         let view = View::new(&volume.lattice, &camera, [64; 2], &quality).expect("a view");
@@ -64,7 +64,7 @@ fn records_are_empty_between_parts() {
         (near, 0.0, Sums::I16, 2.0),
         (near, 0.0, Sums::I32, 1.0),
     ] {
-        let quality = Quality { sums, thickness, ..Quality::default() };
+        let quality = Quality { sums, thickness, ..Quality::before() };
         let to_eye = DVec3::new(1.0, 2.0, up);
         let camera = Camera { to_eye, up: DVec3::Z, target: DVec3::ZERO, projection };
         let view = View::new(&volume.lattice, &camera, [200; 2], &quality).expect("a view");

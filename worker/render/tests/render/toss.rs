@@ -22,7 +22,7 @@ use std::sync::Arc;
 /// A picture of 64x64 of 16x16x16 voxels, seen from anywhere.
 fn frame(to_eye: DVec3, projection: CameraProjection, thickness: f64) -> Frame {
     let volume = Volume::from_fn_u8("any", [16; 3], |i, j, k| (i + 3 * j + 7 * k) as u8);
-    let quality = Quality { thickness, ..Quality::default() };
+    let quality = Quality { thickness, ..Quality::before() };
     let spec = selftest::spec(&volume, quality);
     let camera = Camera { to_eye, up: DVec3::Z, target: DVec3::ZERO, projection };
     let view = View::new(&volume.lattice, &camera, [64; 2], &quality).expect("a view");

@@ -7,13 +7,17 @@
 //! and compared with the reference at a sample of pixels. Beside it stand the same sheets in f64,
 //! where thickness is the only error; what lies between the two is rounding, and is told apart
 //! into positions, f32 arithmetic and integer sums, each by switching the others off.
+//!
+//! Scenes that are classified after reconstruction have one rule; 32-bit and 16-bit sums are
+//! compared with the limit of that order ([`field`]).
 
+mod field;
 mod sweep;
 
 use super::case::number;
 use super::scenes::SCENES;
 use crate::plot;
-use slabcast_common::quality::{Quality, Work};
+use slabcast_common::quality::{Classify, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_scene::path::{Orientation, ProjectionKind, Turntable, ViewPath};
 use slabcast_session::fail::{Fail, say};
@@ -30,7 +34,8 @@ use sweep::{Deviation, Sweep, SweepScene};
 /// Without VOLUME: the scenes by formula. Errors are RMSE in 1/255 over a sample of pixels, from
 /// thick sheets to thin ones; `order` is the power of the thickness with which the error fell
 /// from the line before. Nothing is shut. A turn is seen in both projections, whatever
-/// --projection says.
+/// --projection says. With `--classify before` the compositing rules are compared and roundings
+/// told apart.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_long_help = "\
 Examples:
@@ -96,6 +101,15 @@ pub(crate) fn run(args: &ConvergenceArgs) -> Result<(), Fail> {
         for (name, path) in &paths {
             let camera = path.camera(0, &subject.info.lattice, orientation);
             let camera = camera.map_err(|e| request.blame(&e))?;
+            if subject.quality.classify == Classify::After {
+                let (of, thicknesses) = (&subject, &thicknesses[..]);
+                let swept = field::sweep(of, name, &camera, thicknesses, threads, &mut progress)?;
+                let shown = if args.json { swept.json() } else { swept.text() };
+                progress.suspend(|| say(&shown))?;
+                done += 1;
+                progress.step(progress::Step { frames: done, ..Default::default() });
+                continue;
+            }
             let placed = args.placement && *name == "persp";
             let swept = sweep::sweep(
                 &subject,
@@ -112,7 +126,7 @@ pub(crate) fn run(args: &ConvergenceArgs) -> Result<(), Fail> {
             done += 1;
             progress.step(progress::Step { frames: done, ..Default::default() });
         }
-        if let Some(folder) = &args.plot {
+        if let Some(folder) = args.plot.as_ref().filter(|_| !sweeps.is_empty()) {
             let file = folder.join(format!("{}.svg", subject.name));
             draw(&sweeps, &file)?;
         }
@@ -167,7 +181,7 @@ fn subjects<'a>(
                 let make = move || {
                     let file = Path::new(scene.volume);
                     let (name, tf) = (scene.name.to_string(), Some(scene.transfer));
-                    subject(name, file, tf, FORMULA_SIZE, Quality::default())
+                    subject(name, file, tf, FORMULA_SIZE, request.quality)
                 };
                 (Box::new(make) as OutputFolder, views.clone())
             })

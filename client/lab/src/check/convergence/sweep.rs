@@ -36,7 +36,7 @@ pub(super) struct Deviation {
 }
 
 impl Deviation {
-    fn between(got: &[[f64; 4]], want: &[[f64; 4]]) -> Deviation {
+    pub(super) fn between(got: &[[f64; 4]], want: &[[f64; 4]]) -> Deviation {
         let (mut squares, mut max, mut n) = (0.0, 0.0f64, 0usize);
         for (got, want) in got.iter().zip(want) {
             if got[3] <= 0.0 && want[3] <= 0.0 {

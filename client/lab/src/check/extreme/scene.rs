@@ -78,7 +78,7 @@ pub(super) fn on_lattice(volume: Volume, spacing: [f64; 3], origin: [f64; 3]) ->
 /// `volume` as `transfer` shows it, from an oblique direction, orthographic.
 pub(super) fn shot(volume: Volume, transfer: TransferFunction) -> Shot {
     let view = ortho_camera(&volume, [0.53, 0.71, 0.36], [0.0, 0.0, 1.0]);
-    Shot { volume: Arc::new(volume), transfer, quality: Quality::default(), size: [61, 47], view }
+    Shot { volume: Arc::new(volume), transfer, quality: Quality::before(), size: [61, 47], view }
 }
 
 /// The orthographic camera that sees all of `volume` from direction `to_eye`.

@@ -21,11 +21,12 @@ use crate::kernels::Level;
 use crate::kernels::Simd;
 use glam::{DMat3, DVec3};
 use slabcast_common::kernel::Profile;
-use slabcast_common::math::opacity;
+use slabcast_common::math::{ROUND_F32, opacity};
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::shade::Shader;
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::SampleKind;
+use std::sync::OnceLock;
 
 /// Terms of the number of sub-steps m, `m^2 >= a (K0 + K1 (1 - c) + K2 r)` for the light `a` that a
 /// segment can add, the cosine `c` between its gradients, and the range `r` of its values in 1/255
@@ -37,11 +38,16 @@ const STEPS: [f32; 3] = [100.0, 8000.0, 2.0];
 /// would light flat tissue.
 pub const FLAT_GRADIENT: f64 = 1.0 / 1020.0;
 
+/// Amplitude below which a wave of the sum of weights is left out. Its slope is then at most a
+/// hundredth of a code per vox where values are 50 codes from the background.
+const FAINT_WAVE: f64 = 3e-5;
+
 /// Weight of the kernel inside the volume below which a value is not divided by it.
 const LEAST_WEIGHT: f32 = 0.25;
 
-/// Steps of the table of a kernel's weight near a face, for each lattice step.
-const FACE_STEPS: usize = 32;
+/// Steps of the table of a kernel's weight near a face, for each lattice step. Even, so that half a
+/// lattice step is whole.
+const FACE_STEPS: usize = 16;
 
 /// Two parallel planes between which the field is drawn: the faces of the volume along an index
 /// axis, in lattice steps, or of the cropping box along a world axis, in world units.
@@ -53,6 +59,61 @@ struct Faces {
     /// Coordinates of the faces.
     lo: f32,
     hi: f32,
+    /// Distance from a face below which a kernel reaches beyond it; 0 for a cropping box, whose
+    /// voxels go on.
+    reach: f32,
+}
+
+/// One wave of the sum of all voxels' weights, which is 1 on average and repeats from voxel to voxel:
+/// `2 a cos(2 pi phase)`.
+#[derive(Clone, Copy, Debug)]
+struct Wave {
+    /// The phase in cycles: `along . eye + from`.
+    along: [f32; 3],
+    from: f32,
+    /// `2 a`, and minus `4 pi a along`: derivatives along the eye's axes have the sine.
+    cosine: f32,
+    sine: [f32; 3],
+}
+
+impl Wave {
+    /// Waves of the sum of weights of the kernel with `profile` in coordinates `own_from_index` of
+    /// the index, strongest first: by Poisson's formula a is the kernel's Fourier transform at the
+    /// points of the reciprocal lattice.
+    fn all(profile: &Profile, own_from_index: &DMat3, view: &View) -> Vec<Wave> {
+        let frequencies = own_from_index.inverse().transpose();
+        let index_from_eye = view.eye_from_index.inverse();
+        let mut waves = Vec::new();
+        for n in 63..125 {
+            // One of each pair of opposite points up to two cycles a step.
+            let cycles =
+                DVec3::new(f64::from(n % 5 - 2), f64::from(n / 5 % 5 - 2), f64::from(n / 25 - 2));
+            let frequency = frequencies * cycles;
+            let transform: f64 =
+                frequency.to_array().iter().map(|&f| profile.transform_at(f)).product();
+            if 2.0 * transform.abs() < FAINT_WAVE {
+                continue;
+            }
+            let along = index_from_eye.transpose() * cycles;
+            let sine = along * (-2.0 * std::f64::consts::TAU * transform);
+            waves.push(Wave {
+                along: along.to_array().map(|x| x as f32),
+                from: -along.dot(view.eye_origin) as f32,
+                cosine: (2.0 * transform) as f32,
+                sine: sine.to_array().map(|x| x as f32),
+            });
+        }
+        waves.sort_by(|a, b| b.cosine.abs().total_cmp(&a.cosine.abs()));
+        waves
+    }
+}
+
+/// `sin(2 pi t)` for t from -0.5 to 0.5, within 0.0012: a parabola and its square. Waves are a
+/// hundredth of what they are divided out of.
+#[inline(always)]
+fn sine(t: f32) -> f32 {
+    let p = t * (8.0 - 16.0 * t.abs());
+    p * (0.775 + 0.225 * p.abs())
 }
 
 impl Faces {
@@ -93,10 +154,13 @@ pub struct FieldRule {
     faces: [Faces; 3],
     /// Faces of the cropping box, along the axes that it crops.
     crop: Vec<Faces>,
-    /// Weight of a kernel on one side of a face by distance, and its slope per lattice step.
-    face: Box<[[f32; 2]]>,
-    /// Distance from a face beyond which the weight is one, in lattice steps.
-    whole: f32,
+    /// Weights near the faces of each axis, made when a pixel first needs them.
+    weights: OnceLock<[Box<[[f32; 2]]>; 3]>,
+    profile: Profile,
+    /// For each index axis: what a step along the kernel's three axes is along it, in lattice steps.
+    across: [[f64; 3]; 3],
+    /// Waves of the sum of weights.
+    waves: Vec<Wave>,
     projection: Projection,
     size: [f32; 2],
     /// Unit direction to the light in eye axes; `None` for a head light.
@@ -165,14 +229,24 @@ impl FieldRule {
             let column = upright.col(axis) * (per_raw / steps[axis]);
             column.to_array().map(|x| x as f32)
         });
+        let [std, radius] = quality.kernel_shape();
         let index_from_eye = view.eye_from_index.inverse();
+        // Gradients of the kernel's own coordinates, in lattice steps.
+        let own = [0, 1, 2].map(|axis| upright.col(axis) / spread[axis]);
+        let per_own = DMat3::from_cols(own[0], own[1], own[2]).inverse();
+        let across = [0, 1, 2].map(|axis| (per_own * index_from_eye.row(axis)).to_array());
+        let profile = Profile::new(quality.kernel, std, radius);
+        let own_from_index = per_own.inverse().transpose() * view.eye_from_index;
         let faces = [0, 1, 2].map(|axis| {
             let along = index_from_eye.row(axis);
+            let reach: f64 = across[axis].iter().map(|step| step.abs()).sum();
             Faces {
                 along: along.to_array().map(|x| x as f32),
                 from: -along.dot(view.eye_origin) as f32,
                 lo: -0.5,
                 hi: (f64::from(scene.dims[axis]) - 0.5) as f32,
+                // The outermost samples lie half a step behind the face.
+                reach: (radius * reach + 0.5) as f32,
             }
         });
         let crop = scene.crop.iter().map(|crop| {
@@ -182,14 +256,9 @@ impl FieldRule {
                 from: (crop.from - along.dot(view.eye_origin)) as f32,
                 lo: crop.ends[0] as f32,
                 hi: crop.ends[1] as f32,
+                reach: 0.0,
             }
         });
-        let [std, radius] = quality.kernel_shape();
-        let profile = Profile::new(quality.kernel, std, radius);
-        // The outermost samples lie half a step behind the face.
-        let whole = radius + 0.5;
-        let last = libm::ceil(whole * FACE_STEPS as f64) as usize;
-        let face = (0..=last + 1).map(|i| inside(&profile, i as f64 / FACE_STEPS as f64 - 0.5));
         let light = shader.and_then(Shader::light_direction).map(|d| {
             let d = view.eye_from_world * DVec3::new(d.x.into(), d.y.into(), d.z.into());
             d.to_array().map(|x| x as f32)
@@ -208,8 +277,10 @@ impl FieldRule {
             thickness: view.thickness as f32,
             faces,
             crop: crop.collect(),
-            face: face.collect(),
-            whole: whole as f32,
+            weights: OnceLock::new(),
+            profile,
+            across,
+            waves: Wave::all(&profile, &own_from_index, view),
             projection: view.projection,
             size: view.size.map(|n| n as f32),
             light,
@@ -219,7 +290,13 @@ impl FieldRule {
 
     /// Returns this rule without a cut-off: no pixel is ever shut.
     pub(crate) fn never_shut(&self) -> FieldRule {
-        FieldRule { crop: self.crop.clone(), face: self.face.clone(), eps: 0.0, ..*self }
+        FieldRule {
+            crop: self.crop.clone(),
+            weights: OnceLock::new(),
+            waves: self.waves.clone(),
+            eps: 0.0,
+            ..*self
+        }
     }
 
     /// Returns what a voxel adds to a sum for each unit of weight, from its sample's bits: 0 for
@@ -268,15 +345,45 @@ impl FieldRule {
         plane
     }
 
+    /// Divides a plane at depth `z` by the sum of all weights there, as if the volume had no end.
+    #[inline(always)]
+    fn smooth(&self, plane: &mut Plane, ray: &Ray, z: f32) {
+        if self.waves.is_empty() {
+            return;
+        }
+        let [ex, ey] = [ray.at[0] + ray.slope[0] * z, ray.at[1] + ray.slope[1] * z];
+        let (mut weight, mut slope) = (1.0f32, [0.0f32; 3]);
+        for wave in &self.waves {
+            let [x, y, d] = wave.along;
+            let phase = x * ex + y * ey + d * z + wave.from;
+            let t = phase - ((phase + ROUND_F32) - ROUND_F32);
+            let quarter = t + 0.25;
+            let ahead = quarter - ((quarter + ROUND_F32) - ROUND_F32);
+            weight += wave.cosine * sine(ahead);
+            let sine = sine(t);
+            for axis in 0..3 {
+                slope[axis] += wave.sine[axis] * sine;
+            }
+        }
+        let per_weight = 1.0 / weight;
+        plane.value *= per_weight;
+        for axis in 0..3 {
+            plane.gradient[axis] = (plane.gradient[axis] - plane.value * slope[axis]) * per_weight;
+        }
+    }
+
     /// Divides a plane at depth `z` by the kernel's weight inside the volume, near its faces.
     /// Returns whether the plane lies outside there.
     fn level(&self, plane: &mut Plane, ray: &Ray, z: f32) -> bool {
+        let tables = self.weights.get_or_init(|| {
+            self.across.each_ref().map(|across| face_weights(&self.profile, across))
+        });
         let mut outside = false;
-        for faces in &self.faces {
+        for (faces, table) in self.faces.iter().zip(tables) {
             let q = faces.at(ray, z);
             outside |= (q < faces.lo) | (q > faces.hi);
-            let [lo, lo_slope] = self.beside_face(q - faces.lo);
-            let [hi, hi_slope] = self.beside_face(faces.hi - q);
+            let [lo, lo_slope] = beside_face(table, q - faces.lo);
+            let [hi, hi_slope] = beside_face(table, faces.hi - q);
             let weight = (lo * hi).max(LEAST_WEIGHT);
             let slope = (lo_slope * hi - lo * hi_slope) / weight;
             plane.value /= weight;
@@ -287,23 +394,14 @@ impl FieldRule {
         outside
     }
 
-    /// Weight of the kernel on the inner side of a face at this distance from it, and its slope.
-    fn beside_face(&self, distance: f32) -> [f32; 2] {
-        let at = distance.clamp(0.0, self.whole) * FACE_STEPS as f32;
-        let i = (at as usize).min(self.face.len() - 2);
-        let t = at - i as f32;
-        let [a, b] = [self.face[i], self.face[i + 1]];
-        [a[0] + (b[0] - a[0]) * t, a[1] + (b[1] - a[1]) * t]
-    }
-
     /// Makes the segment from depth `z` on end at the volume's faces, where it is near them: levels
     /// its planes, and continues the field straight to a plane that lies outside, where few samples
     /// reach. Returns the part of the segment that is inside, in shares of it.
     fn end_at_faces(&self, segment: &mut Segment, ray: &Ray, z: f32) -> [f32; 2] {
         let ends = [z, z + self.thickness];
-        let near = |f: &Faces, reach: f32| ends.iter().any(|&z| f.depth(f.at(ray, z)) < reach);
-        if !self.faces.iter().any(|f| near(f, self.whole)) {
-            return match self.crop.iter().any(|f| near(f, 0.0)) {
+        let near = |f: &Faces| ends.iter().any(|&z| f.depth(f.at(ray, z)) < f.reach);
+        if !self.faces.iter().any(near) {
+            return match self.crop.iter().any(near) {
                 true => self.clip(ray, z),
                 false => [0.0, 1.0],
             };
@@ -392,7 +490,9 @@ impl FieldRule {
     ) -> (f64, f64) {
         let mut plane = self.plane(sums);
         let ray = self.ray(pixel.map(|p| p as i32));
-        self.level(&mut plane, &ray, (k as f32 + 0.5) * self.thickness);
+        let z = (k as f32 + 0.5) * self.thickness;
+        self.smooth(&mut plane, &ray, z);
+        self.level(&mut plane, &ray, z);
         let [x, y, z] = plane.gradient.map(f64::from);
         let slope = (x * x + y * y + z * z).sqrt();
         (scene.code(f64::from(plane.value + self.cell[0])), slope / scene.cells_per_code())
@@ -416,7 +516,9 @@ impl FieldRule {
         let h = self.thickness;
         let z = (k as f32 - 0.5) * h;
         let ray = self.ray(pixel);
-        let planes = [&row.before, &row.here].map(|sums| self.plane(sums.map(|sums| sums[i])));
+        let mut planes = [&row.before, &row.here].map(|sums| self.plane(sums.map(|sums| sums[i])));
+        self.smooth(&mut planes[0], &ray, z);
+        self.smooth(&mut planes[1], &ray, z + h);
         let slopes = [self.along(&ray, &planes[0]), self.along(&ray, &planes[1])];
         let mut segment = Segment { planes, slopes };
         let [from, to] = self.end_at_faces(&mut segment, &ray, z);
@@ -510,19 +612,64 @@ impl FieldRule {
     }
 }
 
-/// Share of the kernel's sum over an endless row of samples that the samples from 0 on have, at a
-/// distance `u` of lattice steps from sample 0 towards the others, and its slope per step.
-fn inside(profile: &Profile, u: f64) -> [f32; 2] {
-    let reach = libm::ceil(profile.radius) as i32 + 1;
-    let (mut some, mut all) = ([0.0; 2], [0.0; 2]);
-    let middle = libm::floor(u) as i32;
-    for n in middle - reach..=middle + 1 + reach {
-        let (weight, slope) = (profile.at(u - f64::from(n)), profile.slope_at(u - f64::from(n)));
-        all = [all[0] + weight, all[1] + slope];
-        if n >= 0 {
-            some = [some[0] + weight, some[1] + slope];
+/// Weight of the kernel on the inner side of a face at this distance from it, and its slope.
+fn beside_face(table: &[[f32; 2]], distance: f32) -> [f32; 2] {
+    let at = distance.max(0.0) * FACE_STEPS as f32;
+    let i = (at as usize).min(table.len() - 2);
+    let t = (at - i as f32).min(1.0);
+    let [a, b] = [table[i], table[i + 1]];
+    [a[0] + (b[0] - a[0]) * t, a[1] + (b[1] - a[1]) * t]
+}
+
+/// Weights of a kernel inside the volume by the distance from a face, in steps of 1 / [`FACE_STEPS`]
+/// from the face on, and their slopes per lattice step. `across` is what a step along each of the
+/// kernel's axes is along the face's normal.
+///
+/// Across a face the kernel has the profile that its three profiles, scaled by `across`, make when
+/// they are convolved. The weight is that profile's sum over the planes of samples inside, as a
+/// share of the sum over endless planes. The first lies half a step behind the face.
+fn face_weights(profile: &Profile, across: &[f64; 3]) -> Box<[[f32; 2]]> {
+    let steps = FACE_STEPS as i32;
+    // By offset from the middle.
+    let mut normal = vec![1.0];
+    for scale in across.map(f64::abs) {
+        let reach = libm::ceil(profile.radius * scale * f64::from(steps)) as i32;
+        let along: Vec<f64> = (-reach..=reach)
+            .map(|i| {
+                if i == 0 {
+                    profile.at(0.0)
+                } else {
+                    profile.at(f64::from(i) / f64::from(steps) / scale)
+                }
+            })
+            .collect();
+        let sum: f64 = along.iter().sum();
+        let mut both = vec![0.0; normal.len() + along.len() - 1];
+        for (i, a) in normal.iter().enumerate() {
+            for (j, b) in along.iter().enumerate() {
+                both[i + j] += a * b / sum;
+            }
         }
+        normal = both;
     }
-    let share = some[0] / all[0];
-    [share as f32, ((some[1] - share * all[1]) / all[0]) as f32]
+    let half = normal.len() as i32 / 2;
+    // Share at `i` steps from the outermost plane of samples.
+    let share = |i: i32| {
+        let planes = -(half + i.abs()) / steps - 1..=(half + i.abs()) / steps + 1;
+        let (mut inside, mut all) = (0.0, 0.0);
+        for plane in planes {
+            let at = i - plane * steps + half;
+            let weight = usize::try_from(at).ok().and_then(|at| normal.get(at)).unwrap_or(&0.0);
+            all += weight;
+            inside += if plane >= 0 { *weight } else { 0.0 };
+        }
+        inside / all
+    };
+    let first = -steps / 2;
+    (first..=half + 2)
+        .map(|i| {
+            let slope = (share(i + 1) - share(i - 1)) * 0.5 * f64::from(steps);
+            [share(i) as f32, slope as f32]
+        })
+        .collect()
 }

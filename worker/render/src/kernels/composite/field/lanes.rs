@@ -231,6 +231,64 @@ unsafe fn plane<L: Floats>(
     }
 }
 
+/// `sin(2 pi t)`: [`super::sine`].
+#[inline(always)]
+unsafe fn sine<L: Floats>(t: L::Floats) -> L::Floats {
+    // SAFETY: the caller has these instructions.
+    unsafe {
+        let steep = L::sub(L::all(8.0), L::mul(L::all(16.0), abs::<L>(t)));
+        let p = L::mul(t, steep);
+        L::mul(p, L::add(L::all(0.775), L::mul(L::all(0.225), abs::<L>(p))))
+    }
+}
+
+/// What is left of phases when whole cycles are taken away, -0.5 to 0.5.
+#[inline(always)]
+unsafe fn rest<L: Floats>(phase: L::Floats) -> L::Floats {
+    // SAFETY: the caller has these instructions.
+    unsafe {
+        let magic = L::all(ROUND_F32);
+        L::sub(phase, L::sub(L::add(phase, magic), magic))
+    }
+}
+
+/// [`FieldRule::smooth`].
+#[inline(always)]
+unsafe fn smooth<L: Floats>(
+    rule: &FieldRule,
+    plane: &mut Planes<L::Floats>,
+    rays: &Rays<L::Floats>,
+    z: f32,
+) {
+    if rule.waves.is_empty() {
+        return;
+    }
+    // SAFETY: the caller has these instructions.
+    unsafe {
+        let ex = L::add(rays.at[0], L::mul(rays.slope[0], L::all(z)));
+        let ey = L::add(rays.at[1], L::mul(rays.slope[1], L::all(z)));
+        let (mut weight, mut slope) = (L::all(1.0), [L::all(0.0); 3]);
+        for wave in &rule.waves {
+            let [x, y, d] = wave.along;
+            let phase = L::add(L::mul(L::all(x), ex), L::mul(L::all(y), ey));
+            let phase = L::add(L::add(phase, L::all(d * z)), L::all(wave.from));
+            let t = rest::<L>(phase);
+            let ahead = rest::<L>(L::add(t, L::all(0.25)));
+            weight = L::add(weight, L::mul(L::all(wave.cosine), sine::<L>(ahead)));
+            let sine = sine::<L>(t);
+            for axis in 0..3 {
+                slope[axis] = L::add(slope[axis], L::mul(L::all(wave.sine[axis]), sine));
+            }
+        }
+        let per_weight = div_into_one::<L>(weight);
+        plane.value = L::mul(plane.value, per_weight);
+        for axis in 0..3 {
+            let rise = L::sub(plane.gradient[axis], L::mul(plane.value, slope[axis]));
+            plane.gradient[axis] = L::mul(rise, per_weight);
+        }
+    }
+}
+
 /// Lanes in which the plane at depth `z` is near a face of the volume, or outside the cropping
 /// box.
 #[inline(always)]
@@ -240,13 +298,12 @@ unsafe fn near<L: Floats>(rule: &FieldRule, rays: &Rays<L::Floats>, z: f32) -> u
         let ex = L::add(rays.at[0], L::mul(rays.slope[0], L::all(z)));
         let ey = L::add(rays.at[1], L::mul(rays.slope[1], L::all(z)));
         let mut near = 0;
-        for (i, faces) in rule.faces.iter().chain(&rule.crop).enumerate() {
+        for faces in rule.faces.iter().chain(&rule.crop) {
             let [x, y, d] = faces.along;
             let q = L::add(L::mul(L::all(x), ex), L::mul(L::all(y), ey));
             let q = L::add(L::add(q, L::all(d * z)), L::all(faces.from));
             let depth = L::least(L::sub(q, L::all(faces.lo)), L::sub(L::all(faces.hi), q));
-            let reach = if i < rule.faces.len() { rule.whole } else { 0.0 };
-            near |= L::bits(L::below(depth, L::all(reach)));
+            near |= L::bits(L::below(depth, L::all(faces.reach)));
         }
         near
     }
@@ -385,6 +442,8 @@ unsafe fn close<L: Floats>(
         let rays = rays::<L>(rule, pixels, at_lane);
         let mut first = plane::<L>(rule, &row.before, at_lane);
         let mut last = plane::<L>(rule, &row.here, at_lane);
+        smooth::<L>(rule, &mut first, &rays, z);
+        smooth::<L>(rule, &mut last, &rays, z + h);
         let mut m0 = along::<L>(rule, &rays, &first);
         let mut m1 = along::<L>(rule, &rays, &last);
         let (mut from, mut to) = (zero, one);

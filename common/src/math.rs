@@ -8,13 +8,12 @@
 
 /// 1.5 * 2^23: adding it to an f32 below 2^22 rounds to the nearest integer, ties to even, and
 /// leaves that integer in the low bits.
-pub const ROUND_F32: f32 = 12_582_912.0;
+const ROUND_F32: f32 = 12_582_912.0;
 /// ln 2 in two parts. The first has 15 trailing zero bits, so its products with small integers are
 /// exact (Cody and Waite).
-pub const LN2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
+const LN2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
 /// Taylor coefficients of `(exp(x) - 1) / x`, highest power first; unitless.
-pub const TAYLOR: [f32; 7] =
-    [1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0];
+const TAYLOR: [f32; 7] = [1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0];
 /// Taylor coefficients of `phi(tau) / tau^2` (see [`phi`]) in powers of tau, highest power first;
 /// unitless.
 pub const PHI: [f32; 5] = [-1.0 / 2016.0, 1.0 / 360.0, -1.0 / 80.0, 1.0 / 24.0, -1.0 / 12.0];

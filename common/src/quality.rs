@@ -95,14 +95,6 @@ pub struct Quality {
     /// Whether bricks and voxels are tested against the occlusion map. Never changes a byte: pixels
     /// are shut either way.
     pub cull: bool,
-    /// Whether grey scenes are drawn in two channels where possible. Never changes a byte.
-    #[serde(skip_serializing_if = "is_true")]
-    pub grey: bool,
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
-fn is_true(b: &bool) -> bool {
-    *b
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
@@ -123,7 +115,6 @@ impl Default for Quality {
             splat: Splat::Direct,
             sums: Sums::Auto,
             cull: true,
-            grey: true,
         }
     }
 }
@@ -292,8 +283,6 @@ pub struct Keep {
     pub normals: bool,
     /// Keep gradient magnitudes that modulate nothing.
     pub gradients: bool,
-    /// Draw a grey scene in three colours: switches [`Quality::grey`] off.
-    pub colours: bool,
 }
 
 /// How the work of a job is cut and scheduled. Never changes a byte.

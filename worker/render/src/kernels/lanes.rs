@@ -72,49 +72,14 @@ pub(crate) trait Lanes {
     /// Four numbers from each of as many places as there are lanes: the first of all places, the
     /// second, and so on. The `i`th begins at the `at[i] * stride`th number behind `from`.
     unsafe fn fours(from: *const u32, stride: usize, at: *const u32) -> [Self::Ints; 4];
-    /// Reads four numbers each of places that follow each other, from `from` on.
-    unsafe fn fours_on(from: *const u32) -> [Self::Ints; 4];
     /// [`Lanes::fours`] of two numbers, which are all that each place has.
     unsafe fn pairs(from: *const u32, at: *const u32) -> [Self::Ints; 2];
-    /// Reads two numbers each of places that follow each other, from `from` on.
-    unsafe fn pairs_on(from: *const u32) -> [Self::Ints; 2];
     /// Reads two numbers each behind two `from`s: four in all.
     unsafe fn twos(from: [*const u32; 2], stride: usize, at: *const u32) -> [Self::Ints; 4];
     /// Whole numbers as floats.
     unsafe fn store_floats(to: *mut f32, a: Self::Ints);
     /// Bits `from` to `from + 31` of the sums of `n` and what lies from `at` on.
     unsafe fn bits_of_sums(n: i64, at: *const i64, from: u32) -> Self::Ints;
-}
-
-/// Lanes that hold floats, too. Comparisons are false where a number is none.
-#[cfg(target_arch = "x86_64")]
-pub(crate) trait Floats: Lanes {
-    /// A float each.
-    type Floats: Copy;
-
-    unsafe fn all(x: f32) -> Self::Floats;
-    unsafe fn load_floats(at: *const f32) -> Self::Floats;
-    unsafe fn put_floats(to: *mut f32, a: Self::Floats);
-    unsafe fn add(a: Self::Floats, b: Self::Floats) -> Self::Floats;
-    unsafe fn sub(a: Self::Floats, b: Self::Floats) -> Self::Floats;
-    unsafe fn mul(a: Self::Floats, b: Self::Floats) -> Self::Floats;
-    unsafe fn div(a: Self::Floats, b: Self::Floats) -> Self::Floats;
-    /// `a` if it is less, else `b`.
-    unsafe fn least(a: Self::Floats, b: Self::Floats) -> Self::Floats;
-    /// `a` if it is more, else `b`.
-    unsafe fn most(a: Self::Floats, b: Self::Floats) -> Self::Floats;
-    /// `a < b`.
-    unsafe fn below(a: Self::Floats, b: Self::Floats) -> Self::Marks;
-    /// `a >= b`.
-    unsafe fn from_on(a: Self::Floats, b: Self::Floats) -> Self::Marks;
-    unsafe fn select(marks: Self::Marks, yes: Self::Floats, no: Self::Floats) -> Self::Floats;
-    /// `a` where it is marked, else 0.
-    unsafe fn only(marks: Self::Marks, a: Self::Floats) -> Self::Floats;
-    /// The bits of each.
-    unsafe fn to_bits(a: Self::Floats) -> Self::Ints;
-    unsafe fn from_bits(a: Self::Ints) -> Self::Floats;
-    /// Whole numbers, towards zero, of what is below 2^31.
-    unsafe fn truncated(a: Self::Floats) -> Self::Ints;
 }
 
 /// For each byte, in the `i`th of eight bytes, which bit is the `i`th that is set.

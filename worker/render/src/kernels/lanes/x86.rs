@@ -1,6 +1,6 @@
 //! Eight lanes of AVX2 and sixteen of AVX-512.
 
-use super::{BESIDE, Floats, Lanes, SPREAD, first};
+use super::{BESIDE, Lanes, SPREAD, first};
 use crate::kernels::by_column;
 use std::arch::x86_64::*;
 
@@ -168,24 +168,6 @@ impl Lanes for Eight {
                 _mm256_castps_si256(_mm256_shuffle_ps::<0b11_01_11_01>(low, high)),
             ]
         }
-        fn fours_on(from: *const u32) -> [__m256i; 4] {
-            let mut places = [_mm256_setzero_si256(); 4];
-            for (i, places) in places.iter_mut().enumerate() {
-                // SAFETY: the caller has four times eight numbers there.
-                *places = unsafe {
-                    let [low, high] = [i, i + 4].map(|i| _mm_loadu_si128(from.add(4 * i).cast()));
-                    _mm256_set_m128i(high, low)
-                };
-            }
-            Eight::turned(places)
-        }
-        fn pairs_on(from: *const u32) -> [__m256i; 2] {
-            // SAFETY: the caller has twice eight numbers there.
-            let [a, b] = unsafe { [_mm256_loadu_ps(from.cast()), _mm256_loadu_ps(from.add(8).cast())] };
-            // Two of each, then in order.
-            [_mm256_shuffle_ps::<0b10_00_10_00>(a, b), _mm256_shuffle_ps::<0b11_01_11_01>(a, b)]
-                .map(|ints| _mm256_permute4x64_epi64::<0b11_01_10_00>(_mm256_castps_si256(ints)))
-        }
         fn twos(from: [*const u32; 2], stride: usize, at: *const u32) -> [__m256i; 4] {
             let [a, b] = from;
             let mut places = [_mm256_setzero_si256(); 4];
@@ -216,37 +198,6 @@ impl Lanes for Eight {
             let both = _mm256_castps_si256(_mm256_shuffle_ps::<0b10_00_10_00>(low, high));
             _mm256_permute4x64_epi64::<0b11_01_10_00>(both)
         }
-    }
-}
-
-impl Floats for Eight {
-    type Floats = __m256;
-
-    with! { "avx2"
-        fn all(x: f32) -> __m256 { _mm256_set1_ps(x) }
-        fn load_floats(at: *const f32) -> __m256 {
-            // SAFETY: the caller has eight numbers there.
-            unsafe { _mm256_loadu_ps(at) }
-        }
-        fn put_floats(to: *mut f32, a: __m256) {
-            // SAFETY: the caller has room for eight there.
-            unsafe { _mm256_storeu_ps(to, a) }
-        }
-        fn add(a: __m256, b: __m256) -> __m256 { _mm256_add_ps(a, b) }
-        fn sub(a: __m256, b: __m256) -> __m256 { _mm256_sub_ps(a, b) }
-        fn mul(a: __m256, b: __m256) -> __m256 { _mm256_mul_ps(a, b) }
-        fn div(a: __m256, b: __m256) -> __m256 { _mm256_div_ps(a, b) }
-        fn least(a: __m256, b: __m256) -> __m256 { _mm256_min_ps(a, b) }
-        fn most(a: __m256, b: __m256) -> __m256 { _mm256_max_ps(a, b) }
-        fn below(a: __m256, b: __m256) -> __m256i { _mm256_castps_si256(_mm256_cmp_ps::<_CMP_LT_OQ>(a, b)) }
-        fn from_on(a: __m256, b: __m256) -> __m256i { _mm256_castps_si256(_mm256_cmp_ps::<_CMP_GE_OQ>(a, b)) }
-        fn select(marks: __m256i, yes: __m256, no: __m256) -> __m256 {
-            _mm256_blendv_ps(no, yes, _mm256_castsi256_ps(marks))
-        }
-        fn only(marks: __m256i, a: __m256) -> __m256 { _mm256_and_ps(_mm256_castsi256_ps(marks), a) }
-        fn to_bits(a: __m256) -> __m256i { _mm256_castps_si256(a) }
-        fn from_bits(a: __m256i) -> __m256 { _mm256_castsi256_ps(a) }
-        fn truncated(a: __m256) -> __m256i { _mm256_cvttps_epi32(a) }
     }
 }
 
@@ -378,35 +329,6 @@ impl Lanes for Sixteen {
                 _mm512_castps_si512(_mm512_shuffle_ps::<0b11_01_11_01>(low, high)),
             ]
         }
-        fn fours_on(from: *const u32) -> [__m512i; 4] {
-            // SAFETY: the caller has four times sixteen numbers there.
-            let places = unsafe {
-                [
-                    _mm512_loadu_si512(from.cast()),
-                    _mm512_loadu_si512(from.add(16).cast()),
-                    _mm512_loadu_si512(from.add(32).cast()),
-                    _mm512_loadu_si512(from.add(48).cast()),
-                ]
-            };
-            // Places 0, 4, 8 and 12, and so on, one a quarter; then in order.
-            let [a, b, c, d] = Sixteen::turned(places);
-            let order = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
-            [
-                _mm512_permutexvar_epi32(order, a),
-                _mm512_permutexvar_epi32(order, b),
-                _mm512_permutexvar_epi32(order, c),
-                _mm512_permutexvar_epi32(order, d),
-            ]
-        }
-        fn pairs_on(from: *const u32) -> [__m512i; 2] {
-            // SAFETY: the caller has twice sixteen numbers there.
-            let [a, b] = unsafe {
-                [_mm512_loadu_si512(from.cast()), _mm512_loadu_si512(from.add(16).cast())]
-            };
-            let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
-            let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
-            [_mm512_permutex2var_epi32(a, even, b), _mm512_permutex2var_epi32(a, odd, b)]
-        }
         fn twos(from: [*const u32; 2], stride: usize, at: *const u32) -> [__m512i; 4] {
             let [a, b] = from;
             let mut places = [_mm512_setzero_si512(); 4];
@@ -438,36 +360,5 @@ impl Lanes for Sixteen {
             let lower = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
             _mm512_permutex2var_epi32(low, lower, high)
         }
-    }
-}
-
-impl Floats for Sixteen {
-    type Floats = __m512;
-
-    with! { "avx512f,avx512vl,avx512dq,avx512bw"
-        fn all(x: f32) -> __m512 { _mm512_set1_ps(x) }
-        fn load_floats(at: *const f32) -> __m512 {
-            // SAFETY: the caller has sixteen numbers there.
-            unsafe { _mm512_loadu_ps(at) }
-        }
-        fn put_floats(to: *mut f32, a: __m512) {
-            // SAFETY: the caller has room for sixteen there.
-            unsafe { _mm512_storeu_ps(to, a) }
-        }
-        fn add(a: __m512, b: __m512) -> __m512 { _mm512_add_ps(a, b) }
-        fn sub(a: __m512, b: __m512) -> __m512 { _mm512_sub_ps(a, b) }
-        fn mul(a: __m512, b: __m512) -> __m512 { _mm512_mul_ps(a, b) }
-        fn div(a: __m512, b: __m512) -> __m512 { _mm512_div_ps(a, b) }
-        fn least(a: __m512, b: __m512) -> __m512 { _mm512_min_ps(a, b) }
-        fn most(a: __m512, b: __m512) -> __m512 { _mm512_max_ps(a, b) }
-        fn below(a: __m512, b: __m512) -> __mmask16 { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(a, b) }
-        fn from_on(a: __m512, b: __m512) -> __mmask16 { _mm512_cmp_ps_mask::<_CMP_GE_OQ>(a, b) }
-        fn select(marks: __mmask16, yes: __m512, no: __m512) -> __m512 {
-            _mm512_mask_blend_ps(marks, no, yes)
-        }
-        fn only(marks: __mmask16, a: __m512) -> __m512 { _mm512_maskz_mov_ps(marks, a) }
-        fn to_bits(a: __m512) -> __m512i { _mm512_castps_si512(a) }
-        fn from_bits(a: __m512i) -> __m512 { _mm512_castsi512_ps(a) }
-        fn truncated(a: __m512) -> __m512i { _mm512_cvttps_epi32(a) }
     }
 }

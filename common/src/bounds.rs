@@ -59,10 +59,6 @@ pub fn cutoff(quality: &Quality) -> f64 {
 /// - colour itself is kept in units of 2^-28, rounded once a sheet: N 2^-29. This is what is
 ///   left of it where sheets add floats.
 ///
-/// In a level view 32-bit contributions are rounded in rows of storeys, then times a weight that is
-/// below one but for narrow kernels, and their sum is rounded once more; so m is one more there,
-/// times that weight if it is larger.
-///
 /// m: a voxel belongs to a cell, and cells of voxels in a box lie in the box grown by half a cell
 /// at each face; so there are no more than the grown box has cells.
 pub fn quantisation(scene: &SceneSpec, view: &View, within: &TightBox) -> f64 {
@@ -84,14 +80,9 @@ pub fn quantisation(scene: &SceneSpec, view: &View, within: &TightBox) -> f64 {
         // Payload, section, row and contribution are each rounded by half a unit, and then times
         // weights below one; three weights by 2^-16, times a payload below 2^15: 3.5 units.
         Sums::I16 => 3.5 / i16_units_per_payload(payload_max, d),
-        _ => {
-            let [std, _] = q.kernel_shape();
-            let down = Profile::new(q.kernel, view.kernel_std.y, view.kernel_radius.y);
-            let weight = down.at(0.0) * view.kernel_std.y / std;
-            0.5 * weight.max(1.0) / f64::from(i32_units_per_payload(payload_max, d))
-        }
+        _ => 0.5 / f64::from(i32_units_per_payload(payload_max, d)),
     };
-    let delta = (met + 1.0) * unit * longest_secant(view);
+    let delta = met * unit * longest_secant(view);
     let times = match q.compositing {
         Compositing::Linear => 2.0 * sheets + 17.0,
         Compositing::Constant => 2.0 * sheets,

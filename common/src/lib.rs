@@ -57,11 +57,11 @@ pub mod volume;
 /// Version of the arithmetic behind the pixels. Two programs that agree on it give the same
 /// bytes for the same view; a change of any golden hash raises it (docs/design/contracts.md,
 /// Exactness).
-pub const PIXELS_VERSION: u32 = 10;
+pub const PIXELS_VERSION: u32 = 11;
 
 pub use protocol::PROTOCOL_VERSION;
 
 /// SHA-256 of the self-test tile that every worker draws before it says hello
 /// (`slabcast_render::selftest`, which also has the test that keeps this constant true).
 pub const SELF_TEST_SHA256: &str =
-    "7e6c3ac2882e16e162b721300888f56132d5f1e7d7586ca6e40a95780f4b385f";
+    "ef65e221cc19af0af60a72185a04324d40cf01752986e83fc2176c6a0722d454";

@@ -96,14 +96,6 @@ pub struct Quality {
     /// Whether bricks and voxels are tested against the occlusion map. Never changes a byte: pixels
     /// are shut either way.
     pub cull: bool,
-    /// Whether grey scenes are drawn in two channels where possible. Never changes a byte.
-    #[serde(skip_serializing_if = "is_true")]
-    pub grey: bool,
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
-fn is_true(b: &bool) -> bool {
-    *b
 }
 
 fn before() -> Classify {
@@ -177,7 +169,6 @@ impl Quality {
             splat: Splat::Direct,
             sums: Sums::Auto,
             cull: true,
-            grey: true,
         }
     }
 
@@ -313,8 +304,6 @@ pub struct Keep {
     pub normals: bool,
     /// Keep gradient magnitudes that modulate nothing.
     pub gradients: bool,
-    /// Draw a grey scene in three colours: switches [`Quality::grey`] off.
-    pub colours: bool,
 }
 
 /// How the work of a job is cut and scheduled. Never changes a byte.

@@ -96,14 +96,6 @@ pub struct TransferFunction {
 }
 
 impl TransferFunction {
-    /// Returns whether everything visible has the same number in all three channels, to the bit.
-    /// Light is white, so this holds of shaded voxels too.
-    pub fn is_grey(&self) -> bool {
-        let one = |[r, g, b]: [f64; 3]| r == g && g == b;
-        let nan = self.nan.opacity == 0.0 || one(self.nan.color);
-        nan && self.colors.iter().all(|&[_, r, g, b]| one([r, g, b]))
-    }
-
     /// Reads and checks the JSON of docs/design/contracts.md.
     ///
     /// # Errors

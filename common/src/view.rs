@@ -367,38 +367,6 @@ impl View {
         Vec3::new(w.x as f32, w.y as f32, w.z as f32)
     }
 
-    /// Computes [`View::direction_to_eye`] of many eye positions, given by axis, in a perspective
-    /// view; equal to it in every bit. `out` gets the world directions by axis.
-    #[inline(always)]
-    pub fn directions_to_eye<const MOST: usize>(
-        &self,
-        [x, y, z]: [&[f64]; 3],
-        out: &mut [[f32; MOST]; 3],
-    ) {
-        let Projection::Persp { distance, .. } = self.projection else {
-            panic!("one direction to the eye of an orthographic view");
-        };
-        let turn = self.eye_from_world.transpose();
-        let n = x.len().min(y.len()).min(z.len()).min(MOST);
-        for i in 0..n {
-            let v = [-x[i], -y[i], -(z[i] + distance)];
-            // glam's square root is a call; this one is an instruction, and rounds as exactly.
-            let len = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
-            let far = len > 1e-12;
-            let len = if far { len } else { 1.0 };
-            let d = v.map(|v| v / len);
-            let d = [
-                if far { d[0] } else { 0.0 },
-                if far { d[1] } else { 0.0 },
-                if far { d[2] } else { -1.0 },
-            ];
-            for axis in 0..3 {
-                let w = turn.x_axis[axis] * d[0] + turn.y_axis[axis] * d[1];
-                out[axis][i] = (w + turn.z_axis[axis] * d[2]) as f32;
-            }
-        }
-    }
-
     /// Returns the eye-space box of the voxel centres of a box in index space.
     fn eye_box(&self, b: &TightBox) -> (DVec3, DVec3) {
         let lo = DVec3::from_array(b.lo.map(f64::from));
@@ -475,12 +443,12 @@ impl View {
 
 /// 1.5 * 2^52: adding it to a number below 2^51 rounds to the nearest integer, ties to even, and
 /// leaves that integer in the low bits of the sum.
-pub const ROUND_F64: f64 = 6_755_399_441_055_744.0;
+const ROUND_F64: f64 = 6_755_399_441_055_744.0;
 
 /// Returns the integer nearest to the number `x`, ties to even, without a library call. `|x| <
 /// 2^31`.
 #[inline(always)]
-pub fn round_i32(x: f64) -> i32 {
+fn round_i32(x: f64) -> i32 {
     (x + ROUND_F64).to_bits() as i32
 }
 

@@ -14,7 +14,7 @@ use slabcast_common::image::{
 };
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::quality::{Classify, Quality, Sums};
+use slabcast_common::quality::{Classify, Quality};
 use slabcast_common::stats::{BrickStats, ErrorStats, FrameStats, LeftOut};
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::Digest32;
@@ -96,7 +96,7 @@ pub(crate) struct FrameSums {
 
 /// Returns the SHA-256 of everything that decides a frame's pixels: [`PIXELS_VERSION`], the
 /// volume's digest, the cropping box (in voxels), transfer function, quality and view.
-/// `Quality::cull` and `Quality::grey` change no pixel and are left out.
+/// `Quality::cull` changes no pixel and is left out.
 ///
 /// [`PIXELS_VERSION`]: slabcast_common::PIXELS_VERSION
 pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
@@ -105,8 +105,7 @@ pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
     h.update(slabcast_common::PIXELS_VERSION.to_le_bytes());
     h.update(scene.volume.digest.0);
     h.update(scene.transfer.to_json());
-    // Neither changes a byte.
-    let quality = Quality { cull: true, grey: true, ..scene.quality };
+    let quality = Quality { cull: true, ..scene.quality };
     h.update(serde_json::to_string(&quality).expect("a quality has no map keys but strings"));
     h.update(view.size[0].to_le_bytes());
     h.update(view.size[1].to_le_bytes());
@@ -197,11 +196,6 @@ fn left_out(
     }
     if matches!(view.projection, Projection::Ortho { .. }) {
         put("scale", None);
-        let whole = matches!(scene.quality.sums, Sums::I32 | Sums::Auto);
-        let plain = scene.transfer.gradient_opacity.is_empty();
-        if scene.quality.grey && whole && plain && scene.transfer.is_grey() {
-            put("colour", None);
-        }
     }
     if request.format == PixelFormat::Rgb8 {
         put("alpha", Some(view.size.iter().map(|&n| u64::from(n)).product()));

@@ -248,26 +248,6 @@ pub(crate) fn measure(of: &VolumeSceneArgs, threads: usize) -> Result<Savings, F
         force: "slabcast worker",
         ..needed("transfer", "workers inside the master's process share its bricks")
     });
-    if frame.has_two_channels() {
-        let three = Quality { grey: false, ..quality };
-        let ([less, more], same) = in_turn([(&base, quality), (&base, three)], threads)?;
-        rows.push(Row {
-            left_out: true,
-            ms: Some(more - less),
-            same: Some(same),
-            force: "--keep colours",
-            ..needed("colour", "all that is seen is grey: two channels instead of four")
-        });
-    } else {
-        rows.push(needed(
-            "colour",
-            if spec.transfer.is_grey() {
-                "grey is drawn in two channels where rays are parallel and sums have 32 bits"
-            } else {
-                "the scene has hues"
-            },
-        ));
-    }
     progress.end();
     Ok(Savings {
         scene: format!("{}, {}", volume.name, request.transfer.name()),

@@ -40,19 +40,6 @@ fn points_are_clamped_interpolated_and_stepped() {
 }
 
 #[test]
-fn grey_is_one_colour_in_all_channels_of_all_that_is_seen() {
-    let mut tf = tf(vec![[10.0, 0.0], [20.0, 0.5]]);
-    tf.nan = NanColour { color: [1.0, 0.0, 1.0], opacity: 0.0 };
-    assert!(tf.is_grey(), "nothing shows the colour of what is not a number");
-    tf.nan.opacity = 0.5;
-    assert!(!tf.is_grey());
-    tf.nan.color = [0.5; 3];
-    assert!(tf.is_grey());
-    tf.colors.push([80.0, 0.9, 0.9, 0.8]);
-    assert!(!tf.is_grey());
-}
-
-#[test]
 fn alpha_one_is_capped_and_extinction_is_not() {
     let mut tf = tf(vec![[0.0, 1.0]]);
     let info = info(Samples::U8(vec![3; 7]));

@@ -25,29 +25,6 @@ fn rounding_goes_to_the_nearest_integer() {
     }
 }
 
-proptest! {
-    #[test]
-    fn directions_to_eye_equal_single_ones_in_every_bit(
-        azimuth in 0.0..6.3f64, tilt in -1.5..1.5f64, distance in 0.01..1e3f64,
-        at in prop::collection::vec(prop::array::uniform3(-50.0..50.0f64), 1..20),
-    ) {
-        let l = Lattice::from_spacing([9, 7, 5], [2.0; 3]);
-        let c = camera(azimuth, tilt, CameraProjection::Persp { fov: 30.0, distance });
-        let v = View::new(&l, &c, [64, 48], &Quality::before()).unwrap();
-        // The eye itself sees no direction to it.
-        let Projection::Persp { distance, .. } = v.projection else { unreachable!() };
-        let at = [at, vec![[0.0, 0.0, -distance]]].concat();
-        let axis = |i: usize| at.iter().map(|p| p[i]).collect::<Vec<_>>();
-        let (x, y, z) = (axis(0), axis(1), axis(2));
-        let mut out = [[0.0; 32]; 3];
-        v.directions_to_eye([&x, &y, &z], &mut out);
-        for (i, p) in at.iter().enumerate() {
-            let want = v.direction_to_eye(DVec3::from_array(*p)).to_array();
-            prop_assert_eq!(out.map(|axis| axis[i].to_bits()), want.map(f32::to_bits));
-        }
-    }
-}
-
 #[test]
 fn picture_axes_are_right_handed() {
     // Seen from +y (the front), +x must be on the left: right = forward x up = -y x z = -x.

@@ -70,7 +70,7 @@ STAGES = [
     ("take", r"kernels/touched\.rs$", r"take"),
     ("put", r"kernels/touched\.rs$", r"^(put|fours)$"),
     ("close", r"kernels/composite/rows\.rs$", r""),
-    ("splat", r"kernels/pixel_records/\w+\.rs$", r""),
+    ("splat", r"kernels/pixel_records\.rs$", r""),
 ]
 
 

@@ -26,10 +26,9 @@ HERTZ = 2000
 # The first that a function's chain of callers has in it; what is left is not of a frame's stages.
 STAGES = [
     ("toss", r"\btoss\b|open_brick|near_all|move_inside|FlatStage.*::toss"),
-    ("fold", r"tiers\.\..*fold|tiers::.*fold|\bweigh\b|\bdown\b|\btouched$|\btouched <"),
-    ("close", r"\bclose|unpack|touched::wide"),
+    ("close", r"\bclose|touched::wide"),
     ("light", r"payloads|light_all"),
-    ("add", r"splat_all|splat_apart|splat_deep|add_flat|add_apart"),
+    ("add", r"pixel_records::"),
     ("look again, place sections", r"\bsplat\b|splat::records|\btouch\b|render_records"),
     ("project", r"Seen|\btight\b|overlaps|View::project|front_to_back|slabcast::local|\bcorner\b|render_into|each_pixel|Part::end"),
 ]

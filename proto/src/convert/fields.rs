@@ -7,7 +7,7 @@
 
 use slabcast_scene::path::ViewPath;
 
-const QUALITY: [&str; 11] = [
+const QUALITY: [&str; 10] = [
     "thickness",
     "eps",
     "kernel",
@@ -18,7 +18,6 @@ const QUALITY: [&str; 11] = [
     "splat",
     "sums",
     "cull",
-    "three_colours",
 ];
 
 const TRANSFER: [&str; 9] = [

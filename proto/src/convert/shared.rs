@@ -50,7 +50,6 @@ pub(super) fn quality_to_wire(q: &Quality) -> wire::Quality {
         splat: splat_to_wire(q.splat),
         sums: sums_to_wire(q.sums),
         cull: Some(q.cull),
-        three_colours: !q.grey,
         classify: classify_to_wire(q.classify),
     }
 }
@@ -80,7 +79,6 @@ pub(super) fn quality_from_wire(
         splat: splat_from_wire("splat", q.splat)?,
         sums: sums_from_wire("sums", q.sums)?,
         cull: q.cull.unwrap_or(d.cull),
-        grey: !q.three_colours,
     };
     quality.check()?;
     Ok(quality)

@@ -162,16 +162,16 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
         0.1..1000.0f64,
         prop::option::of((4u32..=8).prop_map(|p| 1 << p)),
         prop_oneof![Just(Schedule::Auto), Just(Schedule::Slab)],
-        any::<[bool; 6]>(),
+        any::<[bool; 5]>(),
     )
         .prop_map(|(slabs, tiles_per_worker, tile, schedule, flags)| {
-            let [empty, normals, gradients, colours, equal, estimate] = flags;
+            let [empty, normals, gradients, equal, estimate] = flags;
             Work {
                 slabs,
                 tiles_per_worker,
                 tile,
                 schedule,
-                keep: Keep { empty, normals, gradients, colours },
+                keep: Keep { empty, normals, gradients },
                 borders: if equal { Borders::Equal } else { Borders::Data },
                 estimate,
             }

@@ -52,7 +52,6 @@ struct Stage {
 #[derive(Clone, Copy)]
 struct How {
     opacity: f64,
-    grey: bool,
     shaded: bool,
     perspective: bool,
     /// Edge of the picture.
@@ -63,7 +62,7 @@ struct How {
 impl Default for How {
     fn default() -> How {
         let quality = Quality { sums: Sums::I32, ..Quality::before() };
-        How { opacity: 0.9, grey: false, shaded: true, perspective: false, edge: 128, quality }
+        How { opacity: 0.9, shaded: true, perspective: false, edge: 128, quality }
     }
 }
 
@@ -78,11 +77,7 @@ impl How {
 
     fn stage(self) -> Stage {
         let volume = How::volume();
-        let colors = if self.grey {
-            vec![[0.0, 0.2, 0.2, 0.2], [255.0, 1.0, 1.0, 1.0]]
-        } else {
-            vec![[0.0, 0.2, 0.4, 0.9], [255.0, 1.0, 0.8, 0.1]]
-        };
+        let colors = vec![[0.0, 0.2, 0.4, 0.9], [255.0, 1.0, 0.8, 0.1]];
         let transfer = TransferFunction {
             version: 1,
             domain: Domain::Value,
@@ -169,12 +164,6 @@ fn toss_solid_ball_with_only_the_skin_visible(bencher: Bencher<'_, '_>) {
 #[divan::bench]
 fn splat_fog_rgb(bencher: Bencher<'_, '_>) {
     How { opacity: 0.004, ..How::default() }.stage().bench(bencher, |c| c.splatted);
-}
-
-/// Fog in two channels, extinction and grey.
-#[divan::bench]
-fn splat_fog_grey(bencher: Bencher<'_, '_>) {
-    How { opacity: 0.004, grey: true, ..How::default() }.stage().bench(bencher, |c| c.splatted);
 }
 
 /// Fog without lighting.

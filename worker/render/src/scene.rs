@@ -2,11 +2,10 @@
 
 use crate::kernels::composite::field::{FieldRule, FieldScene};
 use crate::kernels::composite::{LANES, Row, Rule};
-use crate::kernels::{Simd, Work, lut};
+use crate::kernels::{Simd, lut};
 use crate::primitives::footprint::{
     Footprint, Footprints, Lean, Leaning, Profile, Sections, Shelf,
 };
-use crate::primitives::lattice_rows::LatticeRows;
 use crate::primitives::positions::{FlatCorner, Places};
 use crate::visibility::open_mask::REACH_MOST;
 use glam::{DVec3, Vec3};
@@ -38,8 +37,6 @@ pub struct Scene {
     pub dims: [u32; 3],
     /// Largest extinction per vox that any code has (largest alpha, for the paper's compositing).
     pub payload_max: f64,
-    /// Whether every colour is grey and the quality allows two channels instead of four.
-    pub grey: bool,
     /// Values and their looks, where they are classified after reconstruction.
     #[doc(hidden)]
     pub field: Option<FieldScene>,
@@ -60,7 +57,6 @@ impl Scene {
             grid: BrickGrid::new(spec.volume.lattice.dims),
             dims: spec.volume.lattice.dims,
             payload_max,
-            grey: spec.quality.grey && spec.transfer.is_grey(),
             shelf: Arc::default(),
         }
     }
@@ -113,9 +109,6 @@ pub struct Frame {
     /// Offsets of sections and rows, where the kernel leans.
     #[doc(hidden)]
     pub leaning: Option<Leaning>,
-    /// Lattice rows, where the camera is level and voxels share them.
-    #[doc(hidden)]
-    pub lattice_rows: Option<LatticeRows>,
 }
 
 /// Integer positions of an orthographic view whose footprints are in a table and small enough for
@@ -127,11 +120,6 @@ pub struct Flat {
     pub places: Places,
     /// Most pixels along x and y from the pixel of a voxel's centre to the edge of its footprint.
     pub reach: [i32; 2],
-}
-
-/// Local index of the voxel at (i, j, k) of its brick.
-fn local_of([i, j, k]: [u32; 3]) -> u16 {
-    (i + 8 * j + 64 * k) as u16
 }
 
 /// Position of a brick's first voxel in a frame.
@@ -207,9 +195,6 @@ impl Frame {
         let leans = !view.kernel_lean.is_none();
         let leaning = leans.then(|| Leaning::new(&view, &profile, &sections, largest));
         let leaning = leaning.filter(Leaning::shows);
-        let level = leaning.is_none() && q.sums != Sums::F32 && !after;
-        let lattice_rows = level.then(|| LatticeRows::new(&view, scene.dims, spread.y, range.end));
-        let mut lattice_rows = lattice_rows.flatten();
         let (raw_scale, unit) = match q.sums {
             Sums::F32 => (1.0, 1.0),
             // Weights are those per step of the lattice and over the thickness, so the payload has
@@ -221,13 +206,7 @@ impl Frame {
             }
             Sums::I32 | Sums::Auto => {
                 let scale = i32_units_per_payload(scene.payload_max, d);
-                // A solid's lattice rows are as its sums.
-                let of_rows = if lattice_rows.is_some() {
-                    f64::from(scale) / spread.y
-                } else {
-                    f64::from(scale)
-                };
-                (of_rows as f32, (1.0 / f64::from(scale)) as f32)
+                (scale, (1.0 / f64::from(scale)) as f32)
             }
         };
         let rule = Rule::new(q.compositing, unit, d / view.kernel_std.z, q.eps as f32);
@@ -243,12 +222,6 @@ impl Frame {
         });
         let reach = reach.filter(|reach| reach.iter().all(|&reach| reach <= REACH_MOST));
         let flat = reach.and_then(|reach| Some(Flat { places: Places::new(&view)?, reach }));
-        if let (Some(lattice_rows), Some(Flat { places, .. })) = (&mut lattice_rows, &flat) {
-            lattice_rows.in_integers(|at| {
-                let corner = places.corner(view.corner_in_eye(at.map(|n| n & !7)));
-                places.at(corner, local_of(at.map(|n| n & 7))).0[1]
-            });
-        }
         let mut offsets = Box::new([[0.0; 512]; 3]);
         for i in 0..512u16 {
             let v = view.offset_in_eye(local_position(i)).to_array();
@@ -262,7 +235,6 @@ impl Frame {
             field,
             flat,
             leaning,
-            lattice_rows,
             sections,
             footprints,
             rule,
@@ -283,12 +255,6 @@ impl Frame {
     /// its last sheet on to the next.
     pub fn looks_at_neighbours(&self) -> bool {
         self.is_field() || self.scene.quality.compositing == Compositing::Linear
-    }
-
-    /// Offsets of the 512 voxels of a brick from its corner, in vox, by the eye's axes.
-    #[doc(hidden)]
-    pub fn offsets(&self) -> &[[f64; 512]; 3] {
-        &self.offsets
     }
 
     /// Returns the position of the first voxel of brick `id`.
@@ -339,20 +305,6 @@ impl Frame {
         }
     }
 
-    /// Returns the lattice row of a voxel, if the view has them.
-    #[doc(hidden)]
-    #[inline]
-    pub fn lattice_row(&self, corner: &Corner, of: u16) -> Option<u32> {
-        let (at, lattice_rows) = (local_position(of), self.lattice_rows.as_ref()?);
-        Some(lattice_rows.of_voxel(std::array::from_fn(|axis| corner.index[axis] + at[axis])))
-    }
-
-    /// Whether all sections of a voxel have the same columns and weights across.
-    pub(crate) fn has_columns_alike(&self) -> bool {
-        let leans = |leaning: &Leaning| leaning.most(0) > 0.0 || leaning.row() != 0;
-        self.flat.is_some() && !self.leaning.as_ref().is_some_and(leans)
-    }
-
     /// Returns the x position, in 1/256 pixel, of a footprint at `at` ([`Frame::screen`]) in row
     /// `y` of pixels. Differs from row to row where the kernel leans within the picture.
     #[doc(hidden)]
@@ -365,23 +317,55 @@ impl Frame {
         at[0] + Lean::along_row(leaning.row(), middle - at[1])
     }
 
-    /// Computes [`Frame::payload`] of many voxels from their samples' bits, their normals and, in
-    /// perspective views, their eye coordinates by axis; opacity by gradient is not supported.
-    /// `out` gets the extinctions, then each colour. There may be more normals than samples, to
-    /// fill [whole registers](crate::kernels::whole_registers); their results are unspecified.
+    /// Computes [`Frame::payload`] of many voxels of an orthographic view from their samples' bits
+    /// and normals; opacity by gradient is not supported. `out` gets the extinctions, then each
+    /// colour. There may be more normals than samples, to fill [whole
+    /// registers](crate::kernels::whole_registers); their results are unspecified. Loops have lengths
+    /// unknown to the compiler, so that it vectorises them.
     ///
     /// # Panics
-    /// If there are fewer normals or eyes than samples; in a perspective view without eyes.
-    #[inline]
+    /// If there are fewer normals than samples; in a perspective view.
+    #[inline(always)]
     pub(crate) fn payloads<const MOST: usize>(
         &self,
         simd: Simd,
         samples: &[u32],
         normals: &[u16],
-        eyes: Option<[&[f64]; 3]>,
         out: &mut [[f32; MOST]; 4],
     ) {
-        simd.run(Payloads { frame: self, samples, normals, eyes, out });
+        let n = normals.len().min(MOST);
+        assert!(samples.len() <= n, "a normal a sample");
+        let table = self.scene.classifier.table();
+        if !table.is_empty() {
+            lut::take(simd, table, samples, out);
+        }
+        let [sigma, colours @ ..] = out;
+        for (i, &sample) in samples.iter().enumerate().take(if table.is_empty() { n } else { 0 }) {
+            let look = self.scene.classifier.classify_bits(sample);
+            sigma[i] = look.sigma;
+            for c in 0..3 {
+                colours[c][i] = look.rgb[c];
+            }
+        }
+        if let Some(shader) = &self.scene.shader {
+            let to_eye = self.to_eye.expect("rays are parallel");
+            let mut lit = [[0.0; MOST]; 2];
+            shader.light_terms_all(normals, |_| to_eye, &mut lit);
+            for colour in &mut *colours {
+                for i in 0..n {
+                    colour[i] =
+                        LightTerms { lambert: lit[0][i], gloss: lit[1][i] }.apply(colour[i]);
+                }
+            }
+        }
+        for sigma in &mut sigma[..n] {
+            *sigma = (f64::from(*sigma) * self.view.cell) as f32 * self.raw_scale;
+        }
+        for colour in colours {
+            for i in 0..n {
+                colour[i] *= sigma[i];
+            }
+        }
     }
 
     /// Returns what voxel `i` of `brick` adds to a plane of a field per unit of weight, in raw
@@ -432,63 +416,5 @@ impl Frame {
         };
         let sigma = (f64::from(look.sigma) * self.view.cell) as f32 * self.raw_scale;
         [sigma, sigma * rgb[0], sigma * rgb[1], sigma * rgb[2]]
-    }
-}
-
-/// The work of [`Frame::payloads`], compiled once for each instruction set. Its loops have lengths
-/// unknown to the compiler, so that it vectorises them.
-struct Payloads<'a, const MOST: usize> {
-    frame: &'a Frame,
-    samples: &'a [u32],
-    normals: &'a [u16],
-    eyes: Option<[&'a [f64]; 3]>,
-    out: &'a mut [[f32; MOST]; 4],
-}
-
-impl<const MOST: usize> Work for Payloads<'_, MOST> {
-    type Out = ();
-    #[inline(always)]
-    fn run(self, simd: Simd) {
-        let Payloads { frame, samples, normals, eyes, out } = self;
-        let n = normals.len().min(MOST);
-        assert!(samples.len() <= n, "a normal a sample");
-        let table = frame.scene.classifier.table();
-        if !table.is_empty() {
-            lut::take(simd, table, samples, out);
-        }
-        let [sigma, colours @ ..] = out;
-        for (i, &sample) in samples.iter().enumerate().take(if table.is_empty() { n } else { 0 }) {
-            let look = frame.scene.classifier.classify_bits(sample);
-            sigma[i] = look.sigma;
-            for c in 0..3 {
-                colours[c][i] = look.rgb[c];
-            }
-        }
-        if let Some(shader) = &frame.scene.shader {
-            let mut lit = [[0.0; MOST]; 2];
-            match (frame.to_eye, eyes) {
-                (Some(to_eye), _) => shader.light_terms_all(normals, |_| to_eye, &mut lit),
-                (None, eyes) => {
-                    let mut to_eye = [[0.0; MOST]; 3];
-                    frame.view.directions_to_eye(eyes.expect("eyes in perspective"), &mut to_eye);
-                    let [x, y, z] = &to_eye;
-                    shader.light_terms_all(normals, |i| Vec3::new(x[i], y[i], z[i]), &mut lit);
-                }
-            }
-            for colour in &mut *colours {
-                for i in 0..n {
-                    colour[i] =
-                        LightTerms { lambert: lit[0][i], gloss: lit[1][i] }.apply(colour[i]);
-                }
-            }
-        }
-        for sigma in &mut sigma[..n] {
-            *sigma = (f64::from(*sigma) * frame.view.cell) as f32 * frame.raw_scale;
-        }
-        for colour in colours {
-            for i in 0..n {
-                colour[i] *= sigma[i];
-            }
-        }
     }
 }

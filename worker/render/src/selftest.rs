@@ -56,8 +56,7 @@ pub fn spec(volume: &Volume, quality: Quality) -> SceneSpec {
 }
 
 /// Draws the self-test with instruction set `simd` and returns its SHA-256: a lit ball with a hole,
-/// 24 voxels wide, from above and with a level camera, in perspective and orthographic, with
-/// integer and float sums, in two slabs.
+/// 24 voxels wide, in perspective and orthographic, with integer and float sums, in two slabs.
 pub fn run(simd: Simd) -> Digest32 {
     let n = 24u32;
     let volume = Volume::from_fn_u8("selftest", [n; 3], |i, j, k| {
@@ -72,19 +71,17 @@ pub fn run(simd: Simd) -> Digest32 {
     // Orthographic views have kernels of their own.
     let ortho = CameraProjection::Ortho { height: 30.0 };
     let ways = [
-        (Sums::I32, persp, 0.4),
-        (Sums::F32, persp, 0.4),
-        (Sums::I16, persp, 0.4),
-        (Sums::I16, ortho, 0.4),
-        // Level views add to lattice rows.
-        (Sums::I32, persp, 0.0),
-        (Sums::I16, ortho, 0.0),
+        (Sums::I32, persp),
+        (Sums::F32, persp),
+        (Sums::I16, persp),
+        (Sums::I16, ortho),
+        (Sums::I32, ortho),
     ];
-    for (sums, projection, up) in ways {
+    for (sums, projection) in ways {
         let quality = Quality { sums, ..Quality::before() };
         let spec = spec(&volume, quality);
         let camera = Camera {
-            to_eye: DVec3::new(0.6, 1.0, up),
+            to_eye: DVec3::new(0.6, 1.0, 0.4),
             up: DVec3::Z,
             target: DVec3::ZERO,
             projection,

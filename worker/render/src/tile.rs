@@ -18,26 +18,20 @@
 //! [`crate::region`] takes a tile through all sheets of a frame while bricks are still arriving: a
 //! part then stops before the first sheet with a missing brick, and goes on from there later.
 //!
-//! Each kind of view has its geometry ([`crate::geometry`]): `general` for every view and every
-//! kind of sums; far faster, for whole-number sums, `ortho` for most orthographic views, `sheared`
-//! for those whose kernel leans, `perspective` for most perspective views, and `shared_rows` for
-//! views with a level camera. `Part::draw` picks the fastest that takes the view.
+//! Views have geometries ([`crate::geometry`]): `ortho` is far faster and for whole-number sums in
+//! orthographic views of cubic lattices, `general` is for every view and every kind of sums, and
+//! `field` for planes of a field. `Part::draw` picks the fastest that takes the view.
 
 use crate::geometry::field::{self, RenderField, RenderFieldApart};
-use crate::geometry::general::{GeneralScratch, Kind, Queues, RenderGeneral, RenderGeneralField};
+use crate::geometry::general::{self, GeneralScratch, Kind, Queues, RenderGeneralField};
 use crate::geometry::open_sheets::{self, Store};
 use crate::geometry::ortho::{self, RenderOrtho};
-use crate::geometry::perspective::{self, Deep, RenderPerspective, RenderPerspectiveSharedRows};
-use crate::geometry::shared_rows::{self, RenderSharedRows};
-use crate::geometry::sheared::{self, RenderSheared};
+use crate::kernels::Simd;
 use crate::kernels::field::FieldSum;
 use crate::kernels::pixel_records::MOST;
-use crate::kernels::row_records::Tiered;
-use crate::kernels::{Grey, Simd};
 pub use crate::part::ProjectedBrick;
 use crate::part::brick_feed::FeedMemory;
 use crate::part::{BrickSource, Io, Part, Pixels};
-use crate::primitives::lattice_rows::LatticeRows;
 use crate::primitives::sizes::PART;
 use crate::scene::{Frame, Scene};
 use slabcast_common::brick::Brick;
@@ -53,9 +47,13 @@ use std::sync::Arc;
 #[derive(Default)]
 pub struct Scratch {
     general: GeneralScratch,
-    /// Memory of the fast geometries, for each number type of sums.
+    /// Memory of the fast geometries for 16-bit sums.
     #[doc(hidden)]
-    pub whole: Whole,
+    pub shorts: Store<i16>,
+    /// Memory of the fast geometries for 32-bit sums.
+    #[doc(hidden)]
+    pub longs: Store<i32>,
+    waiting: Waiting,
     pixels: Pixels,
     /// Indices of the tile's bricks over the part at hand.
     inside: Vec<u32>,
@@ -64,25 +62,10 @@ pub struct Scratch {
     last: Vec<RawSums>,
 }
 
-/// Memory of the fast geometries, for each number type of sums.
-#[doc(hidden)]
-#[derive(Default)]
-pub struct Whole {
-    /// Memory for 16-bit sums in colour.
-    pub shorts: Store<i16>,
-    /// Memory for 32-bit sums in colour.
-    pub longs: Store<i32>,
-    /// Memory for 32-bit sums of scenes whose three colours are one.
-    pub greys: Store<Grey>,
-    waiting: Waiting,
-}
-
 /// Memory for voxels that wait for their sheets.
 #[derive(Default)]
 struct Waiting {
     flat: ortho::Waiting,
-    leaning: sheared::Waiting,
-    deep: perspective::Waiting,
     apart: open_sheets::Queues<field::Apart>,
 }
 
@@ -196,7 +179,7 @@ pub fn render_into(
 /// Pixels and bytes that every voxel of a frame adds to: the memory traffic of splatting.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FootprintCost {
-    /// Width and height of a footprint in pixels; the height is 1 where lattice rows are shared.
+    /// Width and height of a footprint in pixels.
     pub pixels: [usize; 2],
     /// Bytes of sums of one pixel in all sheets that a voxel touches; each is read and written.
     pub bytes: usize,
@@ -207,203 +190,80 @@ impl Frame {
     /// views with whole-number sums whose kernel does not lean.
     pub fn footprint_cost(&self) -> Option<FootprintCost> {
         let Scene { quality, ref classifier, .. } = *self.scene;
+        let most = self.sections.most();
         let channel = match quality.sums {
             Sums::F32 => return None,
             Sums::I16 => size_of::<i16>(),
             Sums::I32 | Sums::Auto => size_of::<i32>(),
         };
-        let most = self.sections.most();
         if ortho::accepts(self).is_none() || classifier.is_modulated() || most > MOST {
             return None;
         }
         let footprint = self.footprints.at(0)?;
         let [across, down] = [0, 1].map(|axis| footprint.phases(axis).map(|phases| phases.len));
-        // In a level view to the row of its lattice row alone.
-        let down = if self.lattice_rows.is_some() { Some(1) } else { down };
-        let channels = if self.has_two_channels() { 2 } else { 4 };
-        let sheets = if most <= 4 { 4 } else { MOST };
-        Some(FootprintCost { pixels: [across?, down?], bytes: channel * channels * sheets })
-    }
-
-    /// Returns whether the frame is drawn with two channels, opacity and grey, instead of four.
-    /// This halves the work, and gives the same pixels, where all that shows is grey.
-    pub fn has_two_channels(&self) -> bool {
-        self.may_have_two_channels() && ortho::accepts(self).is_some()
-    }
-
-    /// Whether 32-bit sums of the frame need two channels alone.
-    fn may_have_two_channels(&self) -> bool {
-        let Scene { grey, quality, ref classifier, .. } = *self.scene;
-        let fits = !classifier.is_modulated() && self.sections.most() <= MOST;
-        grey && fits && matches!(quality.sums, Sums::I32 | Sums::Auto)
+        Some(FootprintCost {
+            pixels: [across?, down?],
+            bytes: 4 * channel * if most <= 4 { 4 } else { MOST },
+        })
     }
 }
 
-impl<'a> Part<'a> {
+impl Part<'_> {
     /// Draws the part with the fastest geometry that takes its view.
     pub(crate) fn draw(self, simd: Simd, scratch: &mut Scratch, io: Io<'_>) {
-        let part = self;
-        let Scratch { general, whole, pixels, .. } = scratch;
+        let Scratch { general, shorts, longs, waiting, pixels, .. } = scratch;
         let GeneralScratch { kinds, queues } = general;
-        if part.frame.is_field() {
-            let Whole { shorts, longs, waiting, .. } = whole;
-            match part.frame.scene.quality.sums {
-                Sums::I16 => {
-                    let kind = (&mut kinds.shorts, queues);
-                    part.render_field(simd, shorts, waiting, kind, pixels, io);
-                }
-                _ => {
-                    let kind = (&mut kinds.longs, queues);
-                    part.render_field(simd, longs, waiting, kind, pixels, io);
-                }
-            }
-            return;
-        }
-        match part.frame.scene.quality.sums {
-            Sums::F32 => {
-                let kind = &mut kinds.floats;
-                simd.run(RenderGeneral { part, kind, queues, pixels, io });
+        match self.frame.scene.quality.sums {
+            Sums::F32 if !self.frame.is_field() => {
+                general::render(&self, &mut kinds.floats, queues, pixels, io);
             }
             Sums::I16 => {
-                let (store, waiting) = (&mut whole.shorts, &mut whole.waiting);
-                part.render(simd, store, waiting, (&mut kinds.shorts, queues), pixels, io);
+                self.draw_whole(simd, shorts, waiting, (&mut kinds.shorts, queues), pixels, io);
             }
-            Sums::I32 | Sums::Auto if part.frame.has_two_channels() => {
-                let Whole { greys: store, waiting, .. } = whole;
-                part.render_grey(simd, store, &mut waiting.flat, pixels, io);
-            }
-            Sums::I32 | Sums::Auto => {
-                if let Some((deep, lattice_rows)) = part.deep_grey() {
-                    let (store, waiting) = (&mut whole.greys, &mut whole.waiting.deep);
-                    let deep =
-                        RenderPerspective::<Grey, 4> { part, deep, store, waiting, pixels, io };
-                    return simd.run(RenderPerspectiveSharedRows { deep, lattice_rows });
-                }
-                let (store, waiting) = (&mut whole.longs, &mut whole.waiting);
-                part.render(simd, store, waiting, (&mut kinds.longs, queues), pixels, io);
-            }
+            _ => self.draw_whole(simd, longs, waiting, (&mut kinds.longs, queues), pixels, io),
         }
     }
 
-    /// Draws the part of a frame whose sheets hold planes of a field.
-    fn render_field<S: FieldSum>(
+    /// Draws the part in whole-number sums.
+    fn draw_whole<S: FieldSum>(
         self,
         simd: Simd,
         store: &mut Store<S>,
-        waiting: &mut Waiting,
+        Waiting { flat: waiting, apart: queues_apart }: &mut Waiting,
         (kind, queues): (&mut Kind<S>, &mut Queues),
         pixels: &mut Pixels,
         io: Io<'_>,
     ) {
         let part = self;
-        let Waiting { flat: waiting, apart, .. } = waiting;
-        match (field::accepts(part.frame), part.frame.sections.most()) {
-            (Some(view), 0..=4) => {
+        let (frame, most) = (part.frame, part.frame.sections.most());
+        // Waiting voxels carry samples and normals; opacity by gradient needs the brick, which the
+        // general geometry looks into.
+        let modulated = frame.scene.classifier.is_modulated();
+        match ortho::accepts(frame).filter(|_| most <= MOST) {
+            Some(view) if frame.is_field() && most <= 4 => {
                 simd.run(RenderField::<S, 4> { part, view, store, waiting, pixels, io });
             }
-            (Some(view), _) => {
+            Some(view) if frame.is_field() => {
                 simd.run(RenderField::<S, MOST> { part, view, store, waiting, pixels, io });
             }
-            (None, most) if field::accepts_apart(part.frame) => {
-                let queues = apart;
+            None if frame.is_field() && field::accepts_apart(frame) => {
+                let queues = queues_apart;
                 if most <= 4 {
                     simd.run(RenderFieldApart::<S, 4> { part, store, queues, pixels, io });
                 } else {
                     simd.run(RenderFieldApart::<S, MOST> { part, store, queues, pixels, io });
                 }
             }
-            (None, _) => simd.run(RenderGeneralField { part, kind, queues, pixels, io }),
-        }
-    }
-
-    /// The perspective view, if it is drawn in two channels: where the camera is level and voxels
-    /// have four sheets. Every further kind takes the compiler seconds, and where the camera is not
-    /// level records would be added to one by one.
-    fn deep_grey(&self) -> Option<(Deep, &'a LatticeRows)> {
-        let lattice_rows = self.frame.lattice_rows.as_ref()?;
-        let may = self.frame.may_have_two_channels() && self.frame.sections.most() <= 4;
-        Some((perspective::accepts(self).filter(|_| may)?, lattice_rows))
-    }
-
-    /// Draws the part of a frame that [has two channels](Frame::has_two_channels).
-    fn render_grey(
-        self,
-        simd: Simd,
-        store: &mut Store<Grey>,
-        waiting: &mut ortho::Waiting,
-        pixels: &mut Pixels,
-        io: Io<'_>,
-    ) {
-        let part = self;
-        if let Some(view) = shared_rows::accepts(part.frame) {
-            if part.frame.sections.most() <= 4 {
-                simd.run(RenderSharedRows::<Grey, 4> { part, view, store, waiting, pixels, io });
-            } else {
-                simd.run(RenderSharedRows::<Grey, MOST> { part, view, store, waiting, pixels, io });
+            None if frame.is_field() => {
+                simd.run(RenderGeneralField { part, kind, queues, pixels, io });
             }
-            return;
-        }
-        let view = ortho::accepts(part.frame).expect("a flat view");
-        if part.frame.sections.most() <= 4 {
-            simd.run(RenderOrtho::<Grey, 4> { part, view, store, waiting, pixels, io });
-        } else {
-            simd.run(RenderOrtho::<Grey, MOST> { part, view, store, waiting, pixels, io });
-        }
-    }
-
-    /// Draws the part in whole-number sums with the fastest geometry that takes its view.
-    fn render<S: Tiered>(
-        self,
-        simd: Simd,
-        store: &mut Store<S>,
-        waiting: &mut Waiting,
-        (kind, queues): (&mut Kind<S>, &mut Queues),
-        pixels: &mut Pixels,
-        io: Io<'_>,
-    ) {
-        // Waiting voxels carry samples and normals; opacity by gradient needs the brick, which the
-        // general geometry looks into.
-        let modulated = self.frame.scene.classifier.is_modulated();
-        match self.frame.sections.most() {
-            _ if modulated => simd.run(RenderGeneral { part: self, kind, queues, pixels, io }),
-            0..=4 => self.render_records::<S, 4>(simd, store, waiting, (kind, queues), pixels, io),
-            5..=MOST => {
-                self.render_records::<S, MOST>(simd, store, waiting, (kind, queues), pixels, io);
+            Some(view) if most <= 4 && !modulated => {
+                simd.run(RenderOrtho::<S, 4> { part, view, store, waiting, pixels, io });
             }
-            _ => simd.run(RenderGeneral { part: self, kind, queues, pixels, io }),
-        }
-    }
-
-    /// Draws as [`Part::render`] does, with records of N sheets.
-    fn render_records<S: Tiered, const N: usize>(
-        self,
-        simd: Simd,
-        store: &mut Store<S>,
-        waiting: &mut Waiting,
-        (kind, queues): (&mut Kind<S>, &mut Queues),
-        pixels: &mut Pixels,
-        io: Io<'_>,
-    ) {
-        let part = self;
-        if let Some(view) = shared_rows::accepts(part.frame) {
-            let waiting = &mut waiting.flat;
-            simd.run(RenderSharedRows::<S, N> { part, view, store, waiting, pixels, io });
-        } else if let Some(view) = ortho::accepts(part.frame) {
-            let waiting = &mut waiting.flat;
-            simd.run(RenderOrtho::<S, N> { part, view, store, waiting, pixels, io });
-        } else if let Some(lean) = sheared::accepts(part.frame) {
-            let waiting = &mut waiting.leaning;
-            simd.run(RenderSheared { part, lean, store, waiting, pixels, io });
-        } else if let Some(deep) = perspective::accepts(&part) {
-            let waiting = &mut waiting.deep;
-            let lattice_rows = part.frame.lattice_rows.as_ref();
-            let deep = RenderPerspective::<S, N> { part, deep, store, waiting, pixels, io };
-            match lattice_rows {
-                Some(lattice_rows) => simd.run(RenderPerspectiveSharedRows { deep, lattice_rows }),
-                None => simd.run(deep),
+            Some(view) if !modulated => {
+                simd.run(RenderOrtho::<S, MOST> { part, view, store, waiting, pixels, io });
             }
-        } else {
-            simd.run(RenderGeneral { part, kind, queues, pixels, io });
+            _ => general::render(&part, kind, queues, pixels, io),
         }
     }
 }

@@ -252,8 +252,8 @@ impl RunProvenance {
                 path,
                 preset: request.transfer.preset().map(String::from),
                 transfer: request.transfer.function(info).map_err(|e| request.blame(&e))?,
-                // Neither changes a byte.
-                quality: Quality { cull: true, grey: true, ..quality },
+                // Culling changes no byte.
+                quality: Quality { cull: true, ..quality },
                 magnify: request.magnify,
                 background: match background {
                     Background::Transparent => Ground::Word("transparent".into()),

@@ -238,7 +238,6 @@ impl QualityArgs {
             splat: self.splat,
             sums: self.sums,
             cull: self.cull,
-            ..default
         };
         q.check().map_err(|e| Fail::flag(&e))?;
         Ok(q)
@@ -281,7 +280,7 @@ impl SceneArgs {
     /// A flag or file is wrong in itself.
     pub fn request_with_target(&self, work: Work) -> Result<RenderRequest, Fail> {
         let SceneArgs { view, picture, quality: flags } = self;
-        let quality = Quality { grey: !work.keep.colours, ..flags.quality()? };
+        let quality = flags.quality()?;
         view.axes.orientation()?;
         let mut path = match &view.path {
             Some(file) => view.path_from_file(file, picture)?,

@@ -5,10 +5,10 @@ use slabcast_common::quality::Keep;
 /// The flag.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct KeepArgs {
-    /// Keep what the scene does not need: empty, normals, gradients, colours
+    /// Keep what the scene does not need: empty, normals, gradients
     ///
     /// To see what leaving it out saves. In bricks: empty (voxels that nothing shows), normals
-    /// (that nothing shades), gradients (that modulate nothing); of a grey scene all three colours.
+    /// (that nothing shades), gradients (that modulate nothing).
     #[arg(
         long,
         value_name = "WHAT,...",
@@ -25,8 +25,6 @@ enum Kept {
     Empty,
     Normals,
     Gradients,
-    #[value(alias = "colors")]
-    Colours,
 }
 
 impl KeepArgs {
@@ -37,7 +35,6 @@ impl KeepArgs {
             empty: has(Kept::Empty),
             normals: has(Kept::Normals),
             gradients: has(Kept::Gradients),
-            colours: has(Kept::Colours),
         }
     }
 }

@@ -9,7 +9,7 @@
 //! more planes than a record holds, are drawn by [`crate::geometry::general`].
 
 use crate::geometry::open_sheets::{Due, EDGE, Queues, Sheets, Stage, Store, slot, walk};
-use crate::geometry::ortho::{self, BATCH, Batch, Packing};
+use crate::geometry::ortho::{self, BATCH, Batch};
 use crate::kernels::field::{FieldSum, Four, planes_of, splat_records, splat_woven, weighted};
 use crate::kernels::pixel_records::{MOST, STRIDE, Splat};
 use crate::kernels::toss::Tossing;
@@ -29,11 +29,6 @@ pub struct RenderField<'a, S: FieldSum, const N: usize> {
     pub(crate) waiting: &'a mut ortho::Waiting,
     pub(crate) pixels: &'a mut Pixels,
     pub(crate) io: Io<'a>,
-}
-
-/// Returns the integer positions of `frame` if its parts may be drawn here.
-pub(crate) fn accepts(frame: &Frame) -> Option<&Flat> {
-    ortho::accepts(frame).filter(|_| frame.is_field() && frame.sections.most() <= MOST)
 }
 
 /// Weights of one axis.
@@ -81,7 +76,7 @@ impl<S: FieldSum, const N: usize> Work for RenderField<'_, S, N> {
     }
 }
 
-impl<S: FieldSum, const N: usize> Stage<Sheets<'_, S, N>> for FieldStage<'_, S> {
+impl<S: FieldSum, const N: usize> Stage<S, N> for FieldStage<'_, S> {
     type Voxel = Splat;
 
     #[inline(always)]
@@ -97,9 +92,8 @@ impl<S: FieldSum, const N: usize> Stage<Sheets<'_, S, N>> for FieldStage<'_, S> 
         queues: &mut Queues<Splat>,
         counters: &mut Counters,
     ) {
-        let packing = Packing::Window(&self.phases);
         let asked = (which, open, queues, counters);
-        ortho::toss(self.part, self.simd, self.flat, packing, self.tossing, asked);
+        ortho::toss(self.part, self.simd, self.flat, &self.phases, self.tossing, asked);
     }
 
     #[inline(always)]
@@ -219,7 +213,7 @@ impl<'a, S: FieldSum, const N: usize> Windows<'a, S, N> {
     }
 }
 
-impl<S: FieldSum, const N: usize> Stage<Sheets<'_, S, N>> for ApartStage<'_> {
+impl<S: FieldSum, const N: usize> Stage<S, N> for ApartStage<'_> {
     type Voxel = Apart;
 
     #[inline(always)]

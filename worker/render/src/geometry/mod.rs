@@ -1,21 +1,15 @@
 //! The fast paths and the general one: how voxels of each kind of view get into open sheets.
 //!
-//! | module | views | sums |
+//! | module | views | what sheets hold |
 //! |---|---|---|
-//! | [`ortho`] | orthographic; all sections of a voxel share one footprint | whole numbers |
-//! | [`sheared`] | orthographic; the kernel leans, since the lattice is not cubic | whole numbers |
-//! | [`perspective`] | perspective | whole numbers |
-//! | [`shared_rows`] | level camera: lattice layers are rows of the picture | whole numbers |
+//! | [`ortho`] | orthographic; all sections of a voxel share one footprint | whole-number sums |
+//! | [`field`] | most | planes of a field |
 //! | [`general`] | all | all |
 //!
 //! Each fast path says which views it accepts (`ortho::accepts`); `crate::tile` takes the first
-//! that does. [`open_sheets`] and [`batch`] are shared by the fast ones.
+//! that does. [`open_sheets`] is shared by the fast ones.
 
-pub mod batch;
 pub mod field;
 pub mod general;
 pub mod open_sheets;
 pub mod ortho;
-pub mod perspective;
-pub mod shared_rows;
-pub mod sheared;

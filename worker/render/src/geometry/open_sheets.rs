@@ -4,12 +4,9 @@
 //! compositing of sheets are here. Touched pixels are known by a bit each. A sheet that closes
 //! reads only the open ones among them, sixteen at a time from wherever they lie.
 
-use crate::kernels::composite::rows::close_rows;
 use crate::kernels::composite::{LANES, Row};
 use crate::kernels::pixel_records::{Line, Record, Recorded, STRIDE};
-use crate::kernels::row_records::Tiers;
-use crate::kernels::row_records::{Folded, Shape};
-use crate::kernels::touched::{Places, Some16, column_and_row, put, take, unpack};
+use crate::kernels::touched::{Places, Some16, column_and_row, put, take};
 use crate::kernels::{Simd, Work};
 use crate::part::{Io, Part, Pixels, keep_last};
 use crate::primitives::sizes::PART;
@@ -20,42 +17,17 @@ use slabcast_common::view::Projection;
 /// Edge of a part in pixels, as an index.
 pub const EDGE: usize = PART as usize;
 
-/// Memory of a render thread for the sums of one number type: records, tiers, and sums of closed
-/// sheets.
+/// Memory of a render thread for the sums of one number type: records, and sums of closed sheets.
 pub struct Store<S: Recorded> {
     /// Records of any number of sheets; nothing in them between parts.
     lines: Vec<Line>,
-    pub(crate) closes: Closes<S>,
-    pub(crate) level: SharedRowsStore<S>,
-}
-
-/// Memory for level views.
-pub(crate) struct SharedRowsStore<S: Recorded> {
-    /// Tiers, in which there is nothing between parts but in margins; and of which shape they are.
-    tiers: Vec<Line>,
-    shape: (Shape, usize),
-    /// Sums of pixels that close.
-    folded: Folded<S>,
-}
-
-impl<S: Recorded> SharedRowsStore<S> {
-    /// Tiers of this shape for so many sheets, and room for the sums of a part's pixels.
-    pub(crate) fn of(&mut self, shape: Shape, sheets: usize) -> (&mut [Line], &mut Folded<S>) {
-        let n = shape.lines(sheets);
-        if self.shape != (shape, sheets) {
-            // Margins lie elsewhere now.
-            self.shape = (shape, sheets);
-            self.tiers.fill(Line::ZERO);
-            self.tiers.resize(n.max(self.tiers.len()), Line::ZERO);
-        }
-        (&mut self.tiers[..n], &mut self.folded)
-    }
+    closes: Closes<S>,
 }
 
 /// Memory for sheets that close: the sums of the sheet in front and the places of closing pixels.
-pub struct Closes<S: Recorded> {
+struct Closes<S: Recorded> {
     /// Sums of the sheet before, where it was touched; elsewhere anything.
-    before: Vec<S::Pixel>,
+    before: Vec<[S; 4]>,
     /// Pixels of `before` that the sheet in front has sums of, a bit each.
     was: Rows,
     places: Places,
@@ -64,23 +36,15 @@ pub struct Closes<S: Recorded> {
 
 impl<S: Recorded> Default for Store<S> {
     fn default() -> Self {
-        let shape = (Shape::default(), 0);
-        let level = SharedRowsStore { tiers: Vec::new(), shape, folded: Folded::default() };
-        Store { lines: Vec::new(), closes: Closes::default(), level }
+        Store { lines: Vec::new(), closes: Closes::default() }
     }
 }
 
 impl<S: Recorded> Store<S> {
-    /// Returns whether no sums are left of any part, and whether there are tiers at all.
-    pub fn is_empty(&mut self) -> (bool, bool) {
-        let SharedRowsStore { tiers, shape: (shape, sheets), .. } = &mut self.level;
-        let empty = match *sheets {
-            4 => Tiers::<S, 4>::new(tiers, *shape).are_empty(),
-            8 => Tiers::<S, 8>::new(tiers, *shape).are_empty(),
-            _ => true,
-        };
+    /// Returns whether no sums are left of any part.
+    pub fn is_empty(&self) -> bool {
         let records: &[u64] = bytemuck::cast_slice(&self.lines);
-        (empty && records.iter().all(|sums| *sums == 0), *sheets > 0)
+        records.iter().all(|sums| *sums == 0)
     }
 }
 
@@ -144,20 +108,8 @@ impl<V> Default for Queues<V> {
     }
 }
 
-/// A container of the open sheets of a part, by the way in which it keeps sums.
-pub trait Open<S: Recorded> {
-    /// Sums of the sheet before by pixel, and where these are.
-    fn before(&mut self) -> (&mut [S::Pixel], &mut Rows);
-    /// From now on voxels begin at sheet `k`.
-    fn begin(&mut self, k: i32);
-    /// Closes sheet `k` where it was touched; whether pixels were shut.
-    fn close(&mut self, k: i32, part: &Part<'_>, open: &mut OpenMask, pixels: &mut Pixels) -> bool;
-    /// Leaves nothing behind, where sheets before `k` are closed.
-    fn empty(&mut self, k: i32);
-}
-
-/// Stage that brings voxels of one kind of view into sheets, which are kept in `H`.
-pub trait Stage<H> {
+/// Stage that brings voxels of one kind of view into sheets.
+pub trait Stage<S: Recorded, const N: usize> {
     /// A voxel waiting in the bucket of its first sheet.
     type Voxel: Copy;
 
@@ -177,7 +129,7 @@ pub trait Stage<H> {
         &mut self,
         due: &Due<'_, Self::Voxel>,
         k: i32,
-        sheets: &mut H,
+        sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
         counters: &mut Counters,
     );
@@ -244,10 +196,10 @@ impl<V> Chunk<'_, V> {
 
 /// Walks through the sheets of `part`'s slab.
 #[inline(always)]
-pub fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
+pub fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
     part: &Part<'_>,
     mut stage: T,
-    mut sheets: H,
+    mut sheets: Sheets<'_, S, N>,
     queues: &mut Queues<T::Voxel>,
     pixels: &mut Pixels,
     (out, counters): Io<'_>,
@@ -255,9 +207,9 @@ pub fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
     let slab = part.slab;
     let mut open = part.begin(pixels, out);
     if let Some(last) = &out.last {
-        let (before, was) = sheets.before();
+        let Closes { before, was, .. } = &mut *sheets.closes;
         part.each_pixel(|x, y, tile| {
-            before[y * STRIDE + x] = S::from_raw(last[tile]);
+            before[y * STRIDE + x] = last[tile].map(S::from_bits);
         });
         *was = [u64::MAX; EDGE];
     }
@@ -301,11 +253,11 @@ pub fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
     }
     part.end(pixels, out);
     if let Some(last) = keep_last(part, stopped, out) {
-        let (before, was) = sheets.before();
-        // Nobody reads a shut pixel's sums; they may be anything, so they are none.
+        let Closes { before, was, .. } = &*sheets.closes;
+        // The sums of a shut pixel are never read. They are handed on as zeros.
         part.each_pixel(|x, y, tile| {
             let touched = (was[y] & open.row(y)) >> x & 1 == 1;
-            last[tile] = if touched { S::raw(&before[y * STRIDE + x]) } else { [0; 4] };
+            last[tile] = if touched { before[y * STRIDE + x].map(S::bits) } else { [0; 4] };
         });
     }
     sheets.empty(k);
@@ -347,37 +299,13 @@ impl Sifting {
     }
 }
 
-/// Closes the pixels of a sheet whose sums `folded` has side by side.
-#[inline(always)]
-pub fn close_folded<S: Recorded>(
-    simd: Simd,
-    (folded, k): (&Folded<S>, i32),
-    part: &Part<'_>,
-    open: &mut OpenMask,
-    pixels: &mut Pixels,
-) -> bool {
-    let mut some = Closing { simd, part, k, open, pixels, any_shut: false };
-    some.all::<S>(folded.places(), |i, _, _, row| {
-        let (sheets, opacities) = folded.sums(i);
-        unpack::<S>(simd, sheets, opacities, row);
-    });
-    some.any_shut
-}
-
 impl<S: Recorded> Closes<S> {
     /// Begins a part.
     #[inline(always)]
-    pub(crate) fn begin(&mut self) {
-        self.before.resize(STRIDE * EDGE, S::Pixel::default());
+    fn begin(&mut self) {
+        self.before.resize(STRIDE * EDGE, [S::default(); 4]);
         self.was = [0; EDGE];
         self.sifting = Sifting::default();
-    }
-
-    /// Returns the sums of the closed sheet in front by pixel, and the pixels that have any, a bit
-    /// each ([`Open::before`]).
-    #[inline(always)]
-    pub(crate) fn before(&mut self) -> (&mut [S::Pixel], &mut Rows) {
-        (&mut self.before, &mut self.was)
     }
 
     /// Closes sheet `k`, which `records` hold, at the pixels of `closing`, of those that it
@@ -401,11 +329,28 @@ impl<S: Recorded> Closes<S> {
             places.sift::<S, N>(simd, (records, before), slot);
             sifting.found(n - places.len(), n);
         }
-        let mut some = Closing { simd, part, k, open, pixels, any_shut: false };
-        some.all::<S>(places, |_, places, pixels, row| {
-            take::<S, N>(simd, (&mut *records, &mut *before), pixels, places, slot, row);
-        });
-        some.any_shut
+        let mut row = Row::default();
+        let mut any_shut = false;
+        for i in (0..places.len()).step_by(LANES) {
+            let places = places.from(i);
+            take::<S, N>(simd, (&mut *records, &mut *before), &pixels.all, places, slot, &mut row);
+            // Where rays are parallel, the row's secants stay 1.
+            if let Projection::Persp { .. } = part.frame.view.projection {
+                for (lane, &at) in places.at().iter().enumerate() {
+                    row.secant[lane] = pixels.secants[at as usize];
+                    row.cosine[lane] = 1.0 / row.secant[lane];
+                }
+            }
+            let mut shut = simd.run(Close { part, k, row: &mut row, places });
+            put(simd, &row, &places.at()[..places.len()], &mut pixels.all);
+            any_shut |= shut != 0;
+            while shut != 0 {
+                let [x, y] = column_and_row(places.at()[shut.trailing_zeros() as usize % LANES]);
+                open.close(y, 1 << x);
+                shut &= shut - 1;
+            }
+        }
+        any_shut
     }
 
     /// Clears the sums before a sheet where it closes and the sheet in front had nothing; notes
@@ -419,7 +364,7 @@ impl<S: Recorded> Closes<S> {
             while fresh != 0 {
                 let x = fresh.trailing_zeros();
                 let run = (fresh >> x).trailing_ones();
-                before[y * STRIDE + x as usize..][..run as usize].fill(S::Pixel::default());
+                before[y * STRIDE + x as usize..][..run as usize].fill([S::default(); 4]);
                 // Adding carries through the run.
                 fresh &= fresh.wrapping_add(1 << x);
             }
@@ -447,23 +392,20 @@ pub fn slot<const N: usize>(k: i32) -> usize {
     k as usize % N
 }
 
-impl<S: Recorded, const N: usize> Open<S> for Sheets<'_, S, N> {
-    #[inline(always)]
-    fn before(&mut self) -> (&mut [S::Pixel], &mut Rows) {
-        self.closes.before()
-    }
-
+impl<S: Recorded, const N: usize> Sheets<'_, S, N> {
+    /// From now on voxels begin at sheet `k`.
     #[inline(always)]
     fn begin(&mut self, k: i32) {
         self.added[slot::<N>(k)] = [0; EDGE];
     }
 
+    /// Closes sheet `k` where it was touched; whether pixels were shut.
     #[inline(always)]
     fn close(&mut self, k: i32, part: &Part<'_>, open: &mut OpenMask, pixels: &mut Pixels) -> bool {
         let touched = self.touched(k + 1 - self.most as i32, k);
         let mut closing = touched;
         for (y, (closing, dead)) in closing.iter_mut().zip(&mut self.dead).enumerate() {
-            // Nobody looks at shut pixels again in this part.
+            // A shut pixel is not read again in this part.
             *dead |= *closing & !open.row(y);
             *closing &= open.row(y);
         }
@@ -477,6 +419,7 @@ impl<S: Recorded, const N: usize> Open<S> for Sheets<'_, S, N> {
         )
     }
 
+    /// Leaves nothing behind, where sheets before `k` are closed.
     #[inline(always)]
     fn empty(&mut self, k: i32) {
         let left = self.touched(k + 1 - self.most as i32, k - 1);
@@ -485,7 +428,7 @@ impl<S: Recorded, const N: usize> Open<S> for Sheets<'_, S, N> {
             if some != 0 {
                 let [from, to] = [some.trailing_zeros(), 64 - some.leading_zeros()];
                 let [from, to] = [from, to].map(|x| y * STRIDE + x as usize);
-                self.records[from..to].fill([S::Pixel::default(); N]);
+                self.records[from..to].fill([[S::default(); 4]; N]);
             }
         }
     }
@@ -553,101 +496,30 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
     }
 }
 
-/// Composites rows of a field's pixels, compiled by itself and not with all that calls it.
-struct CloseField<'a, 'b, const ROWS: usize> {
+/// Composites some pixels of sheet k, compiled by itself and not with all that calls it. Returns
+/// those that are shut now.
+struct Close<'a, 'b> {
     part: &'a Part<'a>,
     k: i32,
-    rows: &'a mut [Row; ROWS],
-    places: [Some16<'b>; ROWS],
-    live: [u32; ROWS],
+    row: &'a mut Row,
+    places: Some16<'b>,
 }
 
-impl<const ROWS: usize> Work for CloseField<'_, '_, ROWS> {
-    type Out = [u32; ROWS];
+impl Work for Close<'_, '_> {
+    type Out = u32;
     #[inline(always)]
-    fn run(self, simd: Simd) -> [u32; ROWS] {
-        let mut shut = [0; ROWS];
-        let CloseField { part, k, rows, places, live } = self;
-        for (i, row) in rows.iter_mut().enumerate() {
-            let mut pixels = [[0; 2]; LANES];
-            for (pixel, &place) in pixels.iter_mut().zip(places[i].at()) {
-                let [x, y] = column_and_row(place);
-                *pixel = [part.rect.x0 + x as i32, part.rect.y0 + y as i32];
-            }
-            shut[i] = part.frame.close_field_row(simd, row, (&pixels, k), live[i]);
+    fn run(self, simd: Simd) -> u32 {
+        let Close { part, k, row, places } = self;
+        let live = (1 << places.len()) - 1;
+        if !part.frame.is_field() {
+            // Records have whole-number sums.
+            return part.frame.rule.close_row::<i32>(row, live);
         }
-        shut
-    }
-}
-
-/// A sheet that is being closed.
-struct Closing<'a> {
-    simd: Simd,
-    part: &'a Part<'a>,
-    k: i32,
-    open: &'a mut OpenMask,
-    pixels: &'a mut Pixels,
-    any_shut: bool,
-}
-
-impl Closing<'_> {
-    /// Composites all of `places`, of which `take` puts those from the `i`th on into a row.
-    #[inline(always)]
-    fn all<S: Recorded>(
-        &mut self,
-        places: &Places,
-        mut take: impl FnMut(usize, Some16<'_>, &[[u32; 4]], &mut Row),
-    ) {
-        let mut rows: [Row; 2] = Default::default();
-        for i in (0..places.len()).step_by(2 * LANES) {
-            let first = places.from(i);
-            take(i, first, &self.pixels.all, &mut rows[0]);
-            if i + LANES < places.len() {
-                let second = places.from(i + LANES);
-                take(i + LANES, second, &self.pixels.all, &mut rows[1]);
-                self.close::<S, 2>(&mut rows, [first, second]);
-            } else {
-                self.close::<S, 1>(rows.first_chunk_mut().expect("one of two"), [first]);
-            }
+        let mut pixels = [[0; 2]; LANES];
+        for (pixel, &place) in pixels.iter_mut().zip(places.at()) {
+            let [x, y] = column_and_row(place);
+            *pixel = [part.rect.x0 + x as i32, part.rect.y0 + y as i32];
         }
-    }
-
-    /// Composites pixels whose sums are in rows.
-    #[inline(always)]
-    fn close<S: Recorded, const ROWS: usize>(
-        &mut self,
-        rows: &mut [Row; ROWS],
-        places: [Some16<'_>; ROWS],
-    ) {
-        let Closing { simd, part, k, open, pixels, any_shut } = self;
-        // Where rays are parallel, the rows' secants stay 1.
-        if let Projection::Persp { .. } = part.frame.view.projection {
-            for (row, places) in rows.iter_mut().zip(places) {
-                for (secant, &at) in row.secant.iter_mut().zip(places.at()) {
-                    *secant = pixels.secants[at as usize];
-                }
-                for (cosine, secant) in row.cosine.iter_mut().zip(&row.secant) {
-                    *cosine = 1.0 / secant;
-                }
-            }
-        }
-        let mut live = [0; ROWS];
-        for (live, places) in live.iter_mut().zip(places) {
-            *live = (1 << places.len()) - 1;
-        }
-        let shut = if part.frame.is_field() {
-            simd.run(CloseField { part, k: *k, rows, places, live })
-        } else {
-            close_rows::<S, ROWS>(*simd, &part.frame.rule, rows, live)
-        };
-        for ((row, places), mut shut) in rows.iter().zip(places).zip(shut) {
-            put(*simd, row, &places.at()[..places.len()], &mut pixels.all);
-            *any_shut |= shut != 0;
-            while shut != 0 {
-                let [x, y] = column_and_row(places.at()[shut.trailing_zeros() as usize % LANES]);
-                open.close(y, 1 << x);
-                shut &= shut - 1;
-            }
-        }
+        part.frame.close_field_row(simd, row, (&pixels, k), live)
     }
 }

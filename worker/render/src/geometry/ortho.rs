@@ -18,7 +18,7 @@
 
 use crate::geometry::open_sheets::{Chunk, Due, EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::kernels::pixel_records::{Recorded, Splat, Table, Tables, splat};
-pub use crate::kernels::toss::{self, Packing, Sieve, Sifted, Tossing, prefetch};
+use crate::kernels::toss::{Sieve, Sifted, Tossing, prefetch};
 use crate::kernels::{Simd, Work, whole_registers};
 use crate::part::{Io, Part, Pixels};
 use crate::primitives::footprint::Phases;
@@ -64,16 +64,15 @@ impl Default for Batch {
 }
 
 impl Batch {
-    /// Takes over those of `some` voxels, which are due at sheet `k`, that are still wanted, notes
-    /// each, and has light fall on them; says how many there are.
+    /// Takes over those of `some` voxels, which are due at sheet `k`, that are still wanted, and
+    /// has light fall on them; says how many there are.
     #[inline(always)]
-    pub(crate) fn light<S: Recorded>(
+    fn light<S: Recorded>(
         &mut self,
         (simd, part, open): (Simd, &Part<'_>, &OpenMask),
         (some, k): (&Chunk<'_, Splat>, i32),
         counters: &mut Counters,
-        mut note: impl FnMut(&Splat),
-        payloads: &mut [S::Payload; BATCH],
+        payloads: &mut [[S::Payload; 4]; BATCH],
     ) -> usize {
         let cull = part.frame.scene.quality.cull;
         let Batch { voxels, gone, samples, normals, light } = self;
@@ -83,15 +82,9 @@ impl Batch {
         });
         for (i, v) in voxels[..n].iter().enumerate() {
             (samples[i], normals[i]) = (v.sample, v.normal());
-            note(v);
         }
-        part.frame.payloads(
-            simd,
-            &samples[..n],
-            &normals[..whole_registers::<BATCH>(n)],
-            None,
-            light,
-        );
+        let normals = &normals[..whole_registers::<BATCH>(n)];
+        part.frame.payloads(simd, &samples[..n], normals, light);
         let [sigma, r, g, b] = light;
         for (i, payload) in payloads[..n].iter_mut().enumerate() {
             *payload = S::payload([sigma[i], r[i], g[i], b[i]]);
@@ -152,7 +145,7 @@ pub(crate) fn toss(
     part: &Part<'_>,
     simd: Simd,
     flat: &Flat,
-    packing: Packing<'_>,
+    across: &[Phases; 2],
     tossing: &mut Tossing,
     (which, open, queues, counters): Asked<'_>,
 ) {
@@ -168,14 +161,15 @@ pub(crate) fn toss(
         i64::from(base) * i64::from(frame.sections.phases()),
     ];
     let sieve = Sieve {
-        places: toss::FlatBrick { places: &flat.places, from: Places::from(corner.flat, origin) },
+        places: &flat.places,
+        from: Places::from(corner.flat, origin),
         open,
         cull: frame.scene.quality.cull,
         sections: &frame.sections,
         // From the sheet that depths are counted from.
         sheets: [slab.first, slab.end].map(|k| k - base),
     };
-    let Sifted { reached, kept } = sieve.sift_ready(simd, brick, packing, tossing);
+    let Sifted { reached, kept } = sieve.sift(simd, brick, across, tossing);
     counters.tossed += kept as u64;
     counters.culled += (reached - kept) as u64;
     for (first, voxel) in tossing.ready(kept) {
@@ -199,7 +193,7 @@ struct FlatStage<'a, S: Recorded> {
     batch: &'a mut Batch,
 }
 
-impl<S: Recorded, const N: usize> Stage<Sheets<'_, S, N>> for FlatStage<'_, S> {
+impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
     type Voxel = Splat;
 
     #[inline(always)]
@@ -216,8 +210,7 @@ impl<S: Recorded, const N: usize> Stage<Sheets<'_, S, N>> for FlatStage<'_, S> {
         counters: &mut Counters,
     ) {
         let asked = (which, open, queues, counters);
-        let packing = Packing::Window(&self.phases);
-        toss(self.part, self.simd, self.flat, packing, self.tossing, asked);
+        toss(self.part, self.simd, self.flat, &self.phases, self.tossing, asked);
     }
 
     #[inline(always)]
@@ -229,29 +222,18 @@ impl<S: Recorded, const N: usize> Stage<Sheets<'_, S, N>> for FlatStage<'_, S> {
         open: &OpenMask,
         counters: &mut Counters,
     ) {
-        let mut payloads = [S::Payload::default(); BATCH];
+        let mut payloads = [[S::Payload::default(); 4]; BATCH];
         let mut corners = [0; EDGE];
         let slot = slot::<N>(k);
         for some in due.chunks(BATCH) {
-            let note = |v: &Splat| {
+            let asked = (self.simd, self.part, open);
+            let n = self.batch.light::<S>(asked, (&some, k), counters, &mut payloads);
+            let Batch { voxels, gone, .. } = &*self.batch;
+            for ((v, &gone), &payload) in voxels[..n].iter().zip(gone).zip(&payloads) {
                 let [x, y] = v.first();
                 corners[y % EDGE] |= 1 << x;
-            };
-            let asked = (sheets.simd, self.part, open);
-            let n = self.batch.light::<S>(asked, (&some, k), counters, note, &mut payloads);
-            let (voxels, payloads) = (&self.batch.voxels[..n], &payloads[..n]);
-            match some {
-                Chunk::Here(_) => {
-                    let (voxels, records) = ((voxels, payloads), &mut *sheets.records);
-                    S::splat_all(sheets.simd, records, voxels, slot, &self.tables);
-                }
-                Chunk::Before(_) => {
-                    for ((v, gone), &payload) in voxels.iter().zip(&self.batch.gone).zip(payloads) {
-                        let (x, y, z) = v.weights(&self.tables);
-                        let left = &z[*gone as usize..];
-                        splat::<S, N>(sheets.records, v.at(), (x, y, left), payload, slot);
-                    }
-                }
+                let voxel = (v, payload, gone as usize);
+                splat::<S, N>(sheets.simd, sheets.records, voxel, slot, &self.tables);
             }
         }
         sheets.touch_all(k, &corners, self.tables.across.map(|t| t.len));

@@ -17,7 +17,7 @@ use crate::primitives::field_taps::FieldTaps;
 use crate::primitives::footprint::{Footprint, Sections};
 
 /// Numbers that planes of a field are summed in.
-pub trait FieldSum: Recorded<Pixel = [Self; 4]> + Sum {
+pub trait FieldSum: Recorded + Sum {
     /// One channel of a weight, or of a payload times weights.
     type Term: bytemuck::Pod + Default + std::fmt::Debug;
 

@@ -72,8 +72,6 @@ pub(crate) trait Lanes {
     /// Four numbers from each of as many places as there are lanes: the first of all places, the
     /// second, and so on. The `i`th begins at the `at[i] * stride`th number behind `from`.
     unsafe fn fours(from: *const u32, stride: usize, at: *const u32) -> [Self::Ints; 4];
-    /// Reads four numbers each of places that follow each other, from `from` on.
-    unsafe fn fours_on(from: *const u32) -> [Self::Ints; 4];
     /// [`Lanes::fours`] of two numbers, which are all that each place has.
     unsafe fn pairs(from: *const u32, at: *const u32) -> [Self::Ints; 2];
     /// Reads two numbers each of places that follow each other, from `from` on.

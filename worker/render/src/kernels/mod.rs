@@ -22,32 +22,12 @@ macro_rules! with {
     )*};
 }
 
-/// Calls the one of four functions that belongs to the level of `simd`.
-macro_rules! at_level {
-    ($simd:expr, $args:tt, $plain:path, $avx2:path, $avx512:path, $neon:path) => {
-        match $simd.0 {
-            Level::Plain => $plain $args,
-            // SAFETY: the value proves that the instructions are there; AVX-512 has AVX2 in it.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe { $avx2 $args },
-            // SAFETY: as above.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { $avx512 $args },
-            // SAFETY: as above.
-            #[cfg(target_arch = "aarch64")]
-            #[allow(unused_unsafe, reason = "what has no lanes there is called plainly")]
-            Level::Neon => unsafe { $neon $args },
-        }
-    };
-}
-
 pub mod composite;
 pub mod field;
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod lanes;
 pub mod lut;
 pub mod pixel_records;
-pub mod row_records;
 pub mod toss;
 pub mod touched;
 
@@ -68,10 +48,6 @@ pub trait Weight: Copy + Default + PartialEq + std::fmt::Debug {
         clip: (i32, i32),
         buffer: &'b mut Vec<Self>,
     ) -> (i32, &'b [Self]);
-    /// Returns the weight for sums of rows that are kept over a length of `spread`: see
-    /// `lattice_rows`.
-    #[must_use]
-    fn of_rows(self, spread: f32) -> Self;
 }
 
 impl Weight for Tap {
@@ -84,11 +60,6 @@ impl Weight for Tap {
         buffer: &'b mut Vec<Tap>,
     ) -> (i32, &'b [Tap]) {
         footprint.weights(axis, pos, clip, buffer)
-    }
-
-    #[inline(always)]
-    fn of_rows(self, spread: f32) -> Tap {
-        Tap::new(self.0 * spread)
     }
 }
 
@@ -103,12 +74,6 @@ impl Weight for i16 {
     ) -> (i32, &'b [i16]) {
         footprint.weights_fixed(axis, pos, clip, buffer)
     }
-
-    /// Their rows are kept as sums are.
-    #[inline(always)]
-    fn of_rows(self, _: f32) -> i16 {
-        self
-    }
 }
 
 /// How contributions are added: a section is `payload * w_z`, a row `section * w_y`, and what is
@@ -118,8 +83,6 @@ pub trait Accumulate: Sum {
     type Weight: Weight;
     /// One channel of a section or a row.
     type Section: Copy;
-    /// Running sum of [lattice rows](Accumulate::down); the default is nothing.
-    type Way: Copy + Default;
 
     /// First sheet of a voxel at depth `z` (in phases), and its section in the `i`th from there.
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Self::Section; 4];
@@ -128,16 +91,6 @@ pub trait Accumulate: Sum {
     /// `self + row * wx`.
     #[must_use]
     fn plus(self, row: Self::Section, wx: Self::Weight) -> Self;
-    /// `way + row * wy`.
-    fn on(way: Self::Way, row: Self, wy: Self::Weight) -> Self::Way;
-    /// Returns the sum that a running sum ends in.
-    fn end(way: Self::Way) -> Self;
-    /// Returns the sum of lattice rows at a pixel, each times its weight [for
-    /// rows](Weight::of_rows), in their order.
-    #[inline(always)]
-    fn down(rows: impl Iterator<Item = (Self, Self::Weight)>) -> Self {
-        Self::end(rows.fold(Self::Way::default(), |way, (row, wy)| Self::on(way, row, wy)))
-    }
 }
 
 /// One channel of a section of 32-bit sums, in raw units, or such a channel times weights. Neither
@@ -191,7 +144,6 @@ pub fn nearest_signed(x: f32) -> i32 {
 impl Accumulate for i32 {
     type Weight = Tap;
     type Section = Section;
-    type Way = f32;
 
     #[inline(always)]
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Section; 4] {
@@ -210,77 +162,12 @@ impl Accumulate for i32 {
         // infinity, or NaN for infinity times 0.
         self.wrapping_add(nearest(row.0 * wx.0))
     }
-
-    /// Floats, since they have one order: four or five of them are off by less than any row is
-    /// rounded.
-    #[inline(always)]
-    fn on(way: f32, row: i32, wy: Tap) -> f32 {
-        way + row as f32 * wy.0
-    }
-
-    #[inline(always)]
-    fn end(way: f32) -> i32 {
-        nearest(way)
-    }
-}
-
-/// 32-bit fixed point of scenes whose three colours are one: as [`i32`], bit for bit.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Grey(i32);
-
-impl Sum for Grey {
-    const WHOLE: bool = true;
-    const GREY: bool = true;
-    #[inline(always)]
-    fn value(self) -> f32 {
-        self.0.value()
-    }
-    #[inline(always)]
-    fn bits(self) -> u32 {
-        self.0.bits()
-    }
-    #[inline(always)]
-    fn from_bits(bits: u32) -> Self {
-        Grey(i32::from_bits(bits))
-    }
-}
-
-impl Accumulate for Grey {
-    type Weight = Tap;
-    type Section = Section;
-    type Way = f32;
-
-    #[inline(always)]
-    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Section; 4] {
-        i32::section(sections, z, i, payload)
-    }
-
-    #[inline(always)]
-    fn row(section: Section, wy: Tap) -> Section {
-        i32::row(section, wy)
-    }
-
-    #[inline(always)]
-    fn plus(self, row: Section, wx: Tap) -> Self {
-        Grey(self.0.plus(row, wx))
-    }
-
-    #[inline(always)]
-    fn on(way: f32, row: Grey, wy: Tap) -> f32 {
-        i32::on(way, row.0, wy)
-    }
-
-    #[inline(always)]
-    fn end(way: f32) -> Grey {
-        Grey(i32::end(way))
-    }
 }
 
 /// Floats, in one order.
 impl Accumulate for f32 {
     type Weight = Tap;
     type Section = f32;
-    type Way = f32;
 
     #[inline(always)]
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [f32; 4] {
@@ -297,16 +184,6 @@ impl Accumulate for f32 {
     fn plus(self, row: f32, wx: Tap) -> Self {
         self + row * wx.0
     }
-
-    #[inline(always)]
-    fn on(way: f32, row: f32, wy: Tap) -> f32 {
-        way + row * wy.0
-    }
-
-    #[inline(always)]
-    fn end(way: f32) -> f32 {
-        way
-    }
 }
 
 /// Returns the product of two numbers in units of 2^-15, rounded to nearest: one instruction on
@@ -321,7 +198,6 @@ pub fn times(a: i16, b: i16) -> i16 {
 impl Accumulate for i16 {
     type Weight = i16;
     type Section = i16;
-    type Way = i16;
 
     #[inline(always)]
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [i16; 4] {
@@ -337,16 +213,6 @@ impl Accumulate for i16 {
     #[inline(always)]
     fn plus(self, row: i16, wx: i16) -> Self {
         self.saturating_add(times(row, wx))
-    }
-
-    #[inline(always)]
-    fn on(way: i16, row: i16, wy: i16) -> i16 {
-        way.saturating_add(times(row, wy))
-    }
-
-    #[inline(always)]
-    fn end(way: i16) -> i16 {
-        way
     }
 }
 
@@ -419,7 +285,7 @@ impl Simd {
         }
         #[cfg(target_arch = "x86_64")]
         {
-            // Whoever has AVX2 has those, too, and a machine that says otherwise is not trusted.
+            // Every CPU with AVX2 has these; a CPU that reports otherwise is not used.
             let counts_bits = is_x86_feature_detected!("popcnt")
                 && is_x86_feature_detected!("lzcnt")
                 && is_x86_feature_detected!("bmi1")

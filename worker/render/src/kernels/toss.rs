@@ -1,21 +1,16 @@
-//! The bucket toss (paper, section 3): which voxels of a brick may show in a part, with all that
-//! drawing them takes.
+//! The bucket toss (paper, section 3) of orthographic views: which voxels of a brick may show in a
+//! part, with all that drawing them takes.
 //!
-//! Voxels are positioned (in orthographic views by an addition), tested against the part's sheets
-//! and one bit of its mask, and those that are left are packed. With AVX-512 that is done for
-//! sixteen local indices at a time, present or not, in orthographic views with AVX2 for eight and
-//! with NEON for four, and voxels that can't show never leave the registers; elsewhere in loops
-//! over plain arrays, one a step, and the kept ones are packed in lanes.
+//! Voxels are positioned by an addition, tested against the part's sheets and one bit of its mask,
+//! and those that are left are packed. That is done for sixteen local indices at a time with
+//! AVX-512, eight with AVX2 and four with NEON, whether a voxel is there or not, and voxels that
+//! can't show never leave the registers. The plain loops are for the baseline, and the lanes must
+//! equal them.
 
-#[cfg(target_arch = "x86_64")]
-mod eight;
-#[cfg(target_arch = "x86_64")]
-mod sixteen;
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod wide;
 
 use super::pixel_records::Splat;
-use super::row_records::Shape;
 use super::{Level, Simd};
 use crate::primitives::footprint::{Phases, Sections};
 use crate::primitives::positions::{FlatCorner, Places};
@@ -23,83 +18,15 @@ use crate::primitives::sizes::PART;
 use crate::visibility::open_mask::OpenMask;
 use slabcast_common::brick::{BRICK_VOXELS, Brick};
 use slabcast_common::shade::NO_NORMAL;
-use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS, View, round_i32};
+use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
 use slabcast_common::volume::Samples;
 
-/// Positions of a brick's voxels: x and y in subpixels from the part's corner, depth in phases.
-pub trait Placing {
-    /// Whether kept voxels carry their positions. If not, they carry their local indices.
-    const KEPT: bool;
-    /// Writes the positions of the voxels with these local indices (0 to 511) to `at`: x, y, depth.
-    fn all(&self, index: &[u16], at: &mut [[i32; 512]; 3]);
-}
-
-/// A brick in an orthographic view: integer positions from the part's corner and a sheet's front.
-pub struct FlatBrick<'a> {
+/// Test that the voxels of a brick must pass.
+pub struct Sieve<'a> {
     /// Integer positions of voxels in the view.
     pub places: &'a Places,
     /// Origin of the brick's positions, by [`Places::from`].
     pub from: FlatCorner,
-}
-
-/// A brick in a perspective view, each voxel at a depth of its own.
-pub struct DeepBrick<'a> {
-    /// Camera of the frame.
-    pub view: &'a View,
-    /// Offsets of the brick's 512 voxels from `corner` in eye space, by axis, in vox.
-    pub offsets: &'a [[f64; 512]; 3],
-    /// Eye coordinates of the brick's first voxel, in vox.
-    pub corner: [f64; 3],
-    /// Subpixels a vox at a distance of one vox from the eye.
-    pub per_depth: f64,
-    /// Distance from eye to target, in vox.
-    pub distance: f64,
-    /// The middle of the picture, in subpixels from the part's corner.
-    pub middle: [f64; 2],
-}
-
-/// Places are tests, not pixels: far ones may be anything that is far.
-const FAR: f64 = 1e6;
-
-impl Placing for FlatBrick<'_> {
-    const KEPT: bool = true;
-
-    #[inline(always)]
-    fn all(&self, index: &[u16], at: &mut [[i32; 512]; 3]) {
-        self.places.all(self.from, index, at);
-    }
-}
-
-impl Placing for DeepBrick<'_> {
-    const KEPT: bool = false;
-
-    #[inline(always)]
-    fn all(&self, index: &[u16], at: &mut [[i32; 512]; 3]) {
-        let [to_x, to_y, to_z] = at;
-        for (i, &local) in index.iter().enumerate() {
-            let [x, y, z] = self.eye(local);
-            let scale = self.per_depth / (z + self.distance);
-            to_x[i] = round_i32((x * scale + self.middle[0]).clamp(-FAR, FAR));
-            to_y[i] = round_i32((y * scale + self.middle[1]).clamp(-FAR, FAR));
-            to_z[i] = self.view.depth_in_phases(z);
-        }
-    }
-}
-
-impl DeepBrick<'_> {
-    /// Eye coordinates of a voxel of the brick.
-    #[inline(always)]
-    pub fn eye(&self, local: u16) -> [f64; 3] {
-        let [x, y, z] = self.offsets;
-        let local = usize::from(local) % 512;
-        [self.corner[0] + x[local], self.corner[1] + y[local], self.corner[2] + z[local]]
-    }
-}
-
-/// Test that the voxels of a brick must pass.
-pub struct Sieve<'a, P> {
-    /// Positions of the voxels.
-    pub places: P,
     /// Open pixels of the part.
     pub open: &'a OpenMask,
     /// Whether voxels around which nothing is open are left out.
@@ -130,7 +57,6 @@ pub struct Tossing {
     cells: [u32; 512],
     samples: [u32; 512],
     normals: [u32; 512],
-    locals: [u32; 512],
     /// First pixels of footprints, and where weights begin.
     windows: [[u32; 512]; 4],
     /// Kept voxels, packed for their buckets.
@@ -146,57 +72,9 @@ impl Default for Tossing {
             cells: [0; 512],
             samples: [0; 512],
             normals: [0; 512],
-            locals: [0; 512],
             windows: [[0; 512]; 4],
             ready: [Splat::default(); 512],
         }
-    }
-}
-
-/// A voxel that was kept.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Kept {
-    /// Number of the voxel's first sheet.
-    pub first: i32,
-    /// Index of the voxel in its brick, 0 to 511.
-    pub local: u16,
-    /// Index of the part's pixel nearest to the voxel's centre, row by row.
-    pub cell: u16,
-    pub(crate) normal: u16,
-    pub(crate) sample: u32,
-}
-
-/// Layout of the kept voxels of an orthographic view.
-#[derive(Clone, Copy)]
-pub enum Packing<'a> {
-    /// With a window of the part and where weights across and down lie.
-    Window(&'a [Phases; 2]),
-    /// With their places.
-    Aside,
-    /// With their tier and a [place](Shape::place) in it, and where weights across lie.
-    Tier(&'a Phases, Shape, &'a TierOf),
-}
-
-/// Map from a voxel's position down the part to its tier: `(y - base) * per`, in units of
-/// 2^-[`TIER_BITS`] tiers, rounded to nearest.
-#[derive(Clone, Copy, Debug)]
-pub struct TierOf {
-    /// Position of tier 0, in subpixels from the part's first row.
-    pub base: i32,
-    /// Tiers a subpixel, in units of 2^-20.
-    pub per: i32,
-}
-
-/// Tiers lie 192 subpixels apart and more ([`crate::primitives::lattice_rows`]), and voxels less
-/// than 2^15 from the part's first row: so products stay below 2^28, and a thousandth of a tier is
-/// told apart.
-pub const TIER_BITS: u32 = 20;
-
-impl TierOf {
-    #[inline(always)]
-    fn at(self, y: i32, rows: usize) -> u32 {
-        let tier = ((y - self.base) * self.per + (1 << (TIER_BITS - 1))) >> TIER_BITS;
-        tier.clamp(0, rows as i32 - 1) as u32
     }
 }
 
@@ -205,18 +83,6 @@ impl Tossing {
     #[inline(always)]
     pub fn ready(&self, kept: usize) -> impl Iterator<Item = (&i32, &Splat)> {
         self.first[..kept].iter().zip(&self.ready[..kept])
-    }
-
-    /// The first `kept` voxels in perspective.
-    #[inline(always)]
-    pub fn kept(&self, kept: usize) -> impl Iterator<Item = Kept> {
-        (0..kept).map(|i| Kept {
-            first: self.first[i],
-            local: self.locals[i] as u16,
-            cell: self.cells[i] as u16,
-            normal: self.normals[i] as u16,
-            sample: self.samples[i],
-        })
     }
 }
 
@@ -250,28 +116,14 @@ fn prefetch_all<T>(items: &[T]) {
     let _ = items;
 }
 
-/// Whether rows from `begin` to the one before `end` have any bit of `columns`.
-#[inline(always)]
-pub fn any_in_rows(simd: Simd, rows: &[u64; 64], [begin, end]: [usize; 2], columns: u64) -> bool {
-    match simd.0 {
-        // SAFETY: the value proves that the instructions are there.
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx512 => unsafe { sixteen::any_in_rows(rows, [begin, end], columns) },
-        // SAFETY: as above.
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx2 => unsafe { eight::any_in_rows(rows, [begin, end], columns) },
-        _ => rows[begin..end].iter().fold(0, |all, row| all | row) & columns != 0,
-    }
-}
-
-impl<P: Placing> Sieve<'_, P> {
-    /// Puts place or local index, first sheet, cell, sample and normal of those that are kept
-    /// beside each other.
+impl Sieve<'_> {
+    /// Puts place, first sheet, cell, sample and normal of the voxels that are kept beside each
+    /// other.
     #[inline(always)]
-    fn sift_plain(&self, simd: Simd, brick: &Brick, tossing: &mut Tossing) -> Sifted {
-        let Tossing { at, first, fate, cells, samples, normals, locals, .. } = tossing;
+    fn sift_plain(&self, brick: &Brick, tossing: &mut Tossing) -> Sifted {
+        let Tossing { at, first, fate, cells, samples, normals, .. } = tossing;
         let n = brick.len().min(BRICK_VOXELS);
-        self.places.all(&brick.index[..n], at);
+        self.places.all(self.from, &brick.index[..n], at);
         let [x, y, z] = at;
         self.open.near_all(&x[..n], &y[..n], cells, fate);
         let [begin, end] = self.sheets;
@@ -288,135 +140,52 @@ impl<P: Placing> Sieve<'_, P> {
             Some(of) => normals.iter_mut().zip(of).for_each(|(to, &of)| *to = of.into()),
             None => normals[..n].fill(NO_NORMAL.into()),
         }
-        if !P::KEPT {
-            locals.iter_mut().zip(&brick.index).for_each(|(to, &of)| *to = of.into());
+        // From the front on, nothing is overwritten that is still to be moved.
+        let mut kept = 0;
+        for i in 0..n {
+            (x[kept], y[kept], z[kept], first[kept]) = (x[i], y[i], z[i], first[i]);
+            (cells[kept], samples[kept], normals[kept]) = (cells[i], samples[i], normals[i]);
+            kept += usize::from(fate[i] >= wanted);
         }
-        let kept = keep(simd, tossing, n, wanted, P::KEPT);
         Sifted { reached, kept }
     }
-}
 
-/// Puts those of the first `n` whose fate is `wanted` or more beside each other, with places or
-/// with local indices; says how many there are.
-#[inline(always)]
-fn keep(simd: Simd, tossing: &mut Tossing, n: usize, wanted: u32, places: bool) -> usize {
-    let n = n.min(BRICK_VOXELS);
-    match simd.0 {
-        // SAFETY: the value proves that the instructions are there.
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx2 if !places => unsafe { wide::keep_eight(tossing, n, wanted) },
-        // SAFETY: as above.
-        #[cfg(target_arch = "aarch64")]
-        Level::Neon if !places => unsafe { wide::keep_four(tossing, n, wanted) },
-        _ => {
-            let Tossing { at, first, fate, cells, samples, normals, locals, .. } = tossing;
-            let [x, y, z] = at;
-            // From the front on, nothing is overwritten that is still to be moved.
-            let mut kept = 0;
-            for i in 0..n {
-                if places {
-                    (x[kept], y[kept], z[kept]) = (x[i], y[i], z[i]);
-                } else {
-                    locals[kept] = locals[i];
-                }
-                first[kept] = first[i];
-                (cells[kept], samples[kept], normals[kept]) = (cells[i], samples[i], normals[i]);
-                kept += usize::from(fate[i] >= wanted);
-            }
-            kept
-        }
-    }
-}
-
-impl Sieve<'_, DeepBrick<'_>> {
-    /// Sifts the voxels of `brick` into `tossing`.
+    /// Sifts the voxels of `brick` into `tossing`, and packs those that are kept for footprints
+    /// whose weights across and down lie as `across` says.
     #[inline(always)]
-    pub fn sift(&self, simd: Simd, brick: &Brick, tossing: &mut Tossing) -> Sifted {
-        match simd.0 {
-            // SAFETY: the value proves that the instructions are there.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { wide::avx512::sift(self, brick, tossing) },
-            // Four divisions at a time are too few to place voxels that are not there, too; NEON
-            // has two.
-            _ => self.sift_plain(simd, brick, tossing),
-        }
-    }
-}
-
-impl Sieve<'_, FlatBrick<'_>> {
-    /// Sifts the voxels of `brick` into `tossing`.
-    #[inline(always)]
-    fn sift(&self, simd: Simd, brick: &Brick, tossing: &mut Tossing) -> Sifted {
-        match simd.0 {
-            // SAFETY: the value proves that the instructions are there.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { wide::avx512::sift(self, brick, tossing) },
-            // SAFETY: as above.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe { wide::avx2::sift(self, brick, tossing) },
-            // SAFETY: as above.
-            #[cfg(target_arch = "aarch64")]
-            Level::Neon => unsafe { wide::neon::sift(self, brick, tossing) },
-            Level::Plain => self.sift_plain(simd, brick, tossing),
-        }
-    }
-
-    /// Sifts the voxels of `brick`, and packs those that are kept.
-    #[inline(always)]
-    pub fn sift_ready(
+    pub fn sift(
         &self,
         simd: Simd,
         brick: &Brick,
-        packing: Packing<'_>,
+        across: &[Phases; 2],
         tossing: &mut Tossing,
     ) -> Sifted {
-        let sifted = self.sift(simd, brick, tossing);
         match simd.0 {
-            // SAFETY: the value proves that the instructions are there.
+            // SAFETY: the value proves that the instructions are there (`Simd::all`).
             #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe {
-                wide::avx512::make_ready(self.sections, packing, sifted.kept, tossing);
-            },
+            Level::Avx512 => unsafe { wide::avx512(self, brick, across, tossing) },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe {
-                wide::avx2::make_ready(self.sections, packing, sifted.kept, tossing);
-            },
+            Level::Avx2 => unsafe { wide::avx2(self, brick, across, tossing) },
             // SAFETY: as above.
             #[cfg(target_arch = "aarch64")]
-            Level::Neon => unsafe {
-                wide::neon::make_ready(self.sections, packing, sifted.kept, tossing);
-            },
-            Level::Plain => make_ready(self.sections, packing, sifted.kept, tossing),
+            Level::Neon => unsafe { wide::neon(self, brick, across, tossing) },
+            Level::Plain => {
+                let sifted = self.sift_plain(brick, tossing);
+                make_ready(self.sections, across, sifted.kept, tossing);
+                sifted
+            }
         }
-        sifted
     }
 }
 
 /// Packs the first `kept`.
 #[inline(always)]
-fn make_ready(sections: &Sections, packing: Packing<'_>, kept: usize, tossing: &mut Tossing) {
+fn make_ready(sections: &Sections, across: &[Phases; 2], kept: usize, tossing: &mut Tossing) {
     let Tossing { at: [x, y, z], cells, samples, normals, windows, ready, .. } = tossing;
     let [x0, from_x, y0, from_y] = windows;
-    match packing {
-        Packing::Window(across) => {
-            move_inside(&across[0], &x[..kept], x0, from_x);
-            move_inside(&across[1], &y[..kept], y0, from_y);
-        }
-        Packing::Aside => {
-            for i in 0..kept {
-                (x0[i], y0[i]) = (0, 0);
-                (from_x[i], from_y[i]) = (x[i] as u32 & 0xffff, y[i] as u32);
-            }
-        }
-        Packing::Tier(phases, shape, tier) => {
-            for i in 0..kept {
-                x0[i] = shape.place(phases.first_at(x[i]));
-                from_x[i] = phases.begin((x[i] & (SUBPIXELS - 1)) as usize) as u32;
-                (y0[i], from_y[i]) = (tier.at(y[i], shape.rows), 0);
-            }
-        }
-    }
+    move_inside(&across[0], &x[..kept], x0, from_x);
+    move_inside(&across[1], &y[..kept], y0, from_y);
     let phases = sections.phases();
     for (j, ready) in ready[..kept].iter_mut().enumerate() {
         ready.place = x0[j] | y0[j] << 8 | cells[j] << 16;

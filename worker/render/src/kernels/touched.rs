@@ -126,21 +126,6 @@ impl Places {
         }
     }
 
-    /// Memory for as many as a part has, and as many more as are stored at once.
-    ///
-    /// # Safety
-    /// What is stored there is inside a part.
-    #[inline(always)]
-    pub(super) unsafe fn room(&mut self) -> &mut [u32; MOST] {
-        &mut self.at
-    }
-
-    /// The first `n` of [that](Places::room) are there.
-    #[inline(always)]
-    pub(super) fn set_len(&mut self, n: usize) {
-        self.n = n;
-    }
-
     /// Returns all listed places, each `row * STRIDE + column`.
     pub fn all(&self) -> &[u32] {
         &self.at[..self.n]
@@ -175,8 +160,7 @@ pub fn first_word<P: bytemuck::Pod>(pixel: &P) -> u32 {
 }
 
 /// Records of open sheets, and sums of the sheet before.
-pub(crate) type SumsOf<'a, S, const N: usize> =
-    (&'a mut [Record<S, N>], &'a mut [<S as Recorded>::Pixel]);
+pub(crate) type SumsOf<'a, S, const N: usize> = (&'a mut [Record<S, N>], &'a mut [[S; 4]]);
 
 /// Takes the sums of sheet k, which `slot` holds, at some places for a row that is to be closed:
 /// those of the sheet before, of the sheet itself, and of the one behind, and the opacity so far.
@@ -225,45 +209,12 @@ fn take_plain<S: Recorded, const N: usize>(
         let sheets = [before[at], records[at][slot], records[at][behind]];
         let to = [&mut row.before, &mut row.here, &mut row.behind];
         for (to, sums) in to.into_iter().zip(sheets) {
-            for (to, bits) in to.iter_mut().zip(S::raw(&sums)) {
-                to[i] = S::from_bits(bits).value();
+            for (to, sum) in to.iter_mut().zip(sums) {
+                to[i] = sum.value();
             }
         }
         row.a[i] = f32::from_bits(pixels[at][0]);
         before[at] = std::mem::take(&mut records[at][slot]);
-    }
-}
-
-/// Fills a row that is to be closed from pixels that lie side by side: `sheets` has their sums in
-/// the sheet before, the closing one and the one behind, `opacities` their opacities so far.
-#[inline(always)]
-pub fn unpack<S: Recorded>(
-    simd: Simd,
-    sheets: [&[S::Pixel; LANES]; 3],
-    opacities: &[f32; LANES],
-    row: &mut Row,
-) {
-    row.a = *opacities;
-    match simd.0 {
-        super::Level::Plain => {
-            let to = [&mut row.before, &mut row.here, &mut row.behind];
-            for (to, sheet) in to.into_iter().zip(sheets) {
-                for (i, sums) in sheet.iter().enumerate() {
-                    for (to, bits) in to.iter_mut().zip(S::raw(sums)) {
-                        to[i] = S::from_bits(bits).value();
-                    }
-                }
-            }
-        }
-        // SAFETY: the value proves that the instructions are there.
-        #[cfg(target_arch = "x86_64")]
-        super::Level::Avx2 => unsafe { wide::avx2::unpack::<S>(sheets, row) },
-        // SAFETY: as above.
-        #[cfg(target_arch = "x86_64")]
-        super::Level::Avx512 => unsafe { wide::avx512::unpack::<S>(sheets, row) },
-        // SAFETY: as above.
-        #[cfg(target_arch = "aarch64")]
-        super::Level::Neon => unsafe { wide::neon::unpack::<S>(sheets, row) },
     }
 }
 
@@ -366,15 +317,6 @@ mod wide {
                 }
 
                 #[target_feature(enable = $features)]
-                pub(in super::super) fn unpack<S: Recorded>(
-                    sheets: [&[S::Pixel; LANES]; 3],
-                    row: &mut Row,
-                ) {
-                    // SAFETY: these are the instructions.
-                    unsafe { super::unpack::<$lanes, S>(sheets, row) }
-                }
-
-                #[target_feature(enable = $features)]
                 #[inline]
                 pub(in super::super) fn fours(row: &Row, to: &mut [[u32; 4]; LANES]) {
                     // SAFETY: these are the instructions.
@@ -419,10 +361,10 @@ mod wide {
         (records, before): SumsOf<'_, S, N>,
         slot: usize,
     ) {
-        const { assert!(size_of::<Record<S, N>>() == N * size_of::<S::Pixel>()) };
+        const { assert!(size_of::<Record<S, N>>() == N * size_of::<[S; 4]>()) };
         let words = (size_of::<Record<S, N>>() / 4) as i32;
         let (records, before) = (&mut records[..PART], &mut before[..PART]);
-        let first: *mut S::Pixel = records.as_mut_ptr().cast();
+        let first: *mut [S; 4] = records.as_mut_ptr().cast();
         let (all, mut kept) = (places.at.as_mut_ptr(), 0);
         let (empty, mut dropped) = (places.dropped.as_mut_ptr(), 0);
         // SAFETY: the caller's. A record has N pixels, and all places are below PART. So many lanes
@@ -444,7 +386,7 @@ mod wide {
             for &at in &places.dropped[..dropped] {
                 let sums = now.add(N * at as usize);
                 before[at as usize] = *sums;
-                *sums = S::Pixel::default();
+                *sums = [S::default(); 4];
             }
         }
         places.n = kept;
@@ -459,13 +401,13 @@ mod wide {
         row: &mut Row,
     ) {
         const { assert!(LANES.is_multiple_of(L::LANES)) };
-        const { assert!(matches!(size_of::<S::Pixel>(), 8 | 16)) };
-        const { assert!(size_of::<Record<S, N>>() == N * size_of::<S::Pixel>()) };
-        let words = size_of::<S::Pixel>() / 4;
+        const { assert!(matches!(size_of::<[S; 4]>(), 8 | 16)) };
+        const { assert!(size_of::<Record<S, N>>() == N * size_of::<[S; 4]>()) };
+        let words = size_of::<[S; 4]>() / 4;
         let (records, before) = (&mut records[..PART], &mut before[..PART]);
         let (pixels, slot, behind) = (&pixels[..PART], slot % N, (slot + 1) % N);
-        let old: *mut S::Pixel = before.as_mut_ptr();
-        let first: *mut S::Pixel = records.as_mut_ptr().cast();
+        let old: *mut [S; 4] = before.as_mut_ptr();
+        let first: *mut [S; 4] = records.as_mut_ptr().cast();
         // SAFETY: the caller's. A record has N pixels. All places are below PART, and there are as
         // many lanes in a row's arrays from `lanes` on.
         unsafe {
@@ -485,7 +427,7 @@ mod wide {
                 } else {
                     let [a, b] = L::pairs(old, at);
                     let [c, d, e, f] = L::twos([now, next], N * words, at);
-                    [shorts::<L, S>(a, b), shorts::<L, S>(c, d), shorts::<L, S>(e, f)]
+                    [shorts::<L>(a, b), shorts::<L>(c, d), shorts::<L>(e, f)]
                 };
                 let to = [&mut row.before, &mut row.here, &mut row.behind];
                 for (to, sums) in to.into_iter().zip(sheets) {
@@ -497,44 +439,14 @@ mod wide {
             for &at in &at[..n] {
                 let now = now.add(N * at as usize);
                 *old.add(at as usize) = *now;
-                *now = S::Pixel::default();
+                *now = [S::default(); 4];
             }
         }
     }
 
+    /// The channels of pixels of two words: four 16-bit sums.
     #[inline(always)]
-    unsafe fn unpack<L: Lanes, S: Recorded>(sheets: [&[S::Pixel; LANES]; 3], row: &mut Row) {
-        const { assert!(matches!(size_of::<S::Pixel>(), 8 | 16)) };
-        const { assert!(LANES.is_multiple_of(L::LANES)) };
-        let words = size_of::<S::Pixel>() / 4;
-        let to = [&mut row.before, &mut row.here, &mut row.behind];
-        for (to, sheet) in to.into_iter().zip(sheets) {
-            for lanes in (0..LANES).step_by(L::LANES) {
-                // SAFETY: the caller's. There are as many pixels, and lanes in a row's arrays, from
-                // `lanes` on.
-                unsafe {
-                    let from: *const u32 = sheet[lanes..].as_ptr().cast();
-                    let sums = if words == 4 {
-                        L::fours_on(from)
-                    } else {
-                        let [a, b] = L::pairs_on(from);
-                        shorts::<L, S>(a, b)
-                    };
-                    for (to, sums) in to.iter_mut().zip(sums) {
-                        L::store_floats(to[lanes..].as_mut_ptr(), sums);
-                    }
-                }
-            }
-        }
-    }
-
-    /// The channels of pixels of two words: four 16-bit sums, or two that are whole words.
-    #[inline(always)]
-    unsafe fn shorts<L: Lanes, S: Recorded>(a: L::Ints, b: L::Ints) -> [L::Ints; 4] {
-        if S::GREY {
-            // Nobody looks at the second and third colour.
-            return [a, b, b, b];
-        }
+    unsafe fn shorts<L: Lanes>(a: L::Ints, b: L::Ints) -> [L::Ints; 4] {
         // SAFETY: the caller's.
         unsafe {
             let [low, high] = [a, b].map(|word| L::down(L::up(word, 16), 16));

@@ -118,8 +118,6 @@ struct Part<S: Accumulate> {
     section: [S::Section; 4],
     wx: S::Weight,
     wy: S::Weight,
-    /// The lattice row that it adds to, in views with a level camera.
-    lattice_row: Option<u32>,
 }
 
 impl<S: Accumulate> Part<S> {
@@ -156,8 +154,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
             for (i, &local) in brick.index.iter().enumerate() {
                 let placed = frame.place(&corner, local);
                 let (first, _) = frame.sections.of(placed.z);
-                let lattice_row = frame.lattice_row(&corner, local);
-                found.push((first, brick.id, i as u16, b as u32, (placed, lattice_row)));
+                found.push((first, brick.id, i as u16, b as u32, placed));
             }
         }
         found.sort_unstable_by_key(|&(first, id, i, ..)| (first, id, i));
@@ -165,7 +162,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
         let (mut bx, mut by) = (Vec::new(), Vec::new());
         let (mut tx, mut ty) = (Vec::new(), Vec::new());
         let (columns, rows) = ((at[0], at[0] + 1), (at[1], at[1] + 1));
-        for (first, _, i, b, (placed, lattice_row)) in found {
+        for (first, _, i, b, placed) in found {
             let z = placed.z;
             let (_, sections) = frame.sections.of(z);
             let mut payload = None;
@@ -193,7 +190,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
                 let parts = pixel.sheets.entry(k).or_default();
                 let weights = [real_x.get(), real_y.get(), wz];
                 let section = S::section(&frame.sections, z, n, &payload);
-                parts.push(Part { voxel, weights, section, wx, wy, lattice_row });
+                parts.push(Part { voxel, weights, section, wx, wy });
             }
         }
         pixel
@@ -202,28 +199,13 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
     /// The sums of sheet `k` of the voxels that begin at `last` or before.
     fn sums(&self, k: i32, last: i32) -> [S; 4] {
         let mut sums = [S::default(); 4];
-        // Lattice rows at the pixel's column, ascending, and their weights there.
-        let mut rows: BTreeMap<u32, ([S; 4], S::Weight)> = BTreeMap::new();
         for part in self.sheets.get(&k).into_iter().flatten() {
             let v = &self.voxels[part.voxel as usize];
             if v.first > last {
                 // Voxels ascend by first sheet.
                 break;
             }
-            match part.lattice_row {
-                None => part.add_to(&mut sums),
-                Some(lattice_row) => {
-                    let (row, _) = rows.entry(lattice_row).or_insert(([S::default(); 4], part.wy));
-                    for c in 0..4 {
-                        row[c] = row[c].plus(part.section[c], part.wx);
-                    }
-                }
-            }
-        }
-        if let Some(lattice_rows) = &self.frame.lattice_rows {
-            let weight = |wy: &S::Weight| wy.of_rows(lattice_rows.spread);
-            let row = |c: usize| rows.values().map(move |(row, wy)| (row[c], weight(wy)));
-            sums = std::array::from_fn(|c| S::down(row(c)));
+            part.add_to(&mut sums);
         }
         sums
     }
@@ -290,18 +272,9 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
     fn sections(&self, k: i32, secant: f32, n: usize) -> (usize, usize, Vec<SectionAtPixel>) {
         let mut all = Vec::new();
         for part in self.sheets.get(&k).into_iter().flatten() {
-            let raw = match &self.frame.lattice_rows {
-                None => {
-                    let mut sums = [S::default(); 4];
-                    part.add_to(&mut sums);
-                    sums[0].value()
-                }
-                // The section's share of a sum that is rounded with others.
-                Some(lattice_rows) => {
-                    let row = S::default().plus(part.section[0], part.wx).value();
-                    row * (part.weights[1] * lattice_rows.spread)
-                }
-            };
+            let mut sums = [S::default(); 4];
+            part.add_to(&mut sums);
+            let raw = sums[0].value();
             if raw > 0.0 {
                 all.push((raw, part));
             }

@@ -9,7 +9,6 @@
 use crate::kernels::composite::Sum;
 use crate::oracle::work_counters::WorkCounters;
 use crate::primitives::footprint::Footprint;
-use crate::primitives::lattice_rows::LatticeRows;
 use crate::scene::Frame;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{FrameState, Picture, TilePixels};
@@ -41,9 +40,9 @@ pub(crate) fn render_counting(
             let add = |to: &mut [[f32; 4]], p: &Section<'_>| {
                 floats(p, |pixel, c, v| to[pixel][c] += v);
             };
-            render_sums(frame, bricks, counters, add, |_, _, _| unreachable!("floats have no rows"))
+            render_sums(frame, bricks, counters, add)
         }
-        Sums::I16 => render_sums(frame, bricks, counters, fixed, down_fixed),
+        Sums::I16 => render_sums(frame, bricks, counters, fixed),
         // Rounded to nearest, ties to even, and saturating, as the splat loop does.
         Sums::I32 | Sums::Auto => {
             let add = |to: &mut [[i32; 4]], p: &Section<'_>| {
@@ -51,7 +50,7 @@ pub(crate) fn render_counting(
                     to[pixel][c] = to[pixel][c].wrapping_add(v.round_ties_even() as i32);
                 });
             };
-            render_sums(frame, bricks, counters, add, down_floats)
+            render_sums(frame, bricks, counters, add)
         }
     }
 }
@@ -65,8 +64,6 @@ struct Section<'a> {
     payload: [f32; 4],
     footprint: Footprint<'a>,
     at: [i64; 2],
-    /// The lattice row that it adds to instead of rows of pixels, in views with a level camera.
-    lattice_row: Option<u32>,
 }
 
 impl Section<'_> {
@@ -90,15 +87,6 @@ fn floats(p: &Section<'_>, mut add: impl FnMut(usize, usize, f32)) {
     let (mut bx, mut by) = (Vec::new(), Vec::new());
     let wz = p.frame.sections.of(p.z).1[p.section];
     let section = p.payload.map(|c| c * wz);
-    if let Some(lattice_row) = p.lattice_row {
-        let (x0, wx) = p.footprint.weights(0, p.at[0], (0, w), &mut bx);
-        for (i, wx) in wx.iter().enumerate() {
-            for c in 0..4 {
-                add(lattice_row as usize * w as usize + x0 as usize + i, c, section[c] * wx.get());
-            }
-        }
-        return;
-    }
     let (y0, wy) = p.footprint.weights(1, p.at[1], (0, h), &mut by);
     for (y, wy) in (y0..).zip(wy) {
         let (x0, wx) = p.footprint.weights(0, p.frame.along_row(p.at, y), (0, w), &mut bx);
@@ -119,16 +107,6 @@ fn fixed(to: &mut [[i16; 4]], p: &Section<'_>) {
     let (mut bx, mut by) = (Vec::new(), Vec::new());
     let wz = p.frame.sections.of_fixed(p.z).1[p.section];
     let section = p.payload.map(|c| times((c + 0.5) as i32, wz));
-    if let Some(lattice_row) = p.lattice_row {
-        let (x0, wx) = p.footprint.weights_fixed(0, p.at[0], (0, w), &mut bx);
-        for (i, &wx) in wx.iter().enumerate() {
-            let pixel = &mut to[lattice_row as usize * w as usize + x0 as usize + i];
-            for c in 0..4 {
-                pixel[c] = (i32::from(pixel[c]) + times(section[c], wx)).min(32767) as i16;
-            }
-        }
-        return;
-    }
     let (y0, wy) = p.footprint.weights_fixed(1, p.at[1], (0, h), &mut by);
     for (y, &wy) in (y0..).zip(wy) {
         let (x0, wx) = p.footprint.weights_fixed(0, p.frame.along_row(p.at, y), (0, w), &mut bx);
@@ -142,39 +120,11 @@ fn fixed(to: &mut [[i16; 4]], p: &Section<'_>) {
     }
 }
 
-/// Position of a lattice row down the picture, in subpixels, and its sums at one column.
-type Above<'a, S> = (i64, &'a [S; 4]);
-
-/// The sum of lattice rows at row `y` of pixels: each row times its weight, rounded to nearest.
-fn down_fixed(footprint: &Footprint<'_>, rows: &[Above<'_, i16>], y: i32) -> [i16; 4] {
-    let (mut sums, mut buffer) = ([0i32; 4], Vec::new());
-    for (at, row) in rows {
-        let (_, wy) = footprint.weights_fixed(1, *at, (y, y + 1), &mut buffer);
-        for (sum, &row) in sums.iter_mut().zip(*row).filter(|_| !wy.is_empty()) {
-            *sum += (i32::from(row) * i32::from(wy[0]) + 16384) >> 15;
-        }
-    }
-    sums.map(|sum| sum.min(32767) as i16)
-}
-
-/// The sum of lattice rows at row `y` of pixels in floats, then rounded.
-fn down_floats(footprint: &Footprint<'_>, rows: &[Above<'_, i32>], y: i32) -> [i32; 4] {
-    let (mut sums, mut buffer) = ([0f32; 4], Vec::new());
-    for (at, row) in rows {
-        let (_, wy) = footprint.weights(1, *at, (y, y + 1), &mut buffer);
-        for (sum, &row) in sums.iter_mut().zip(*row).filter(|_| !wy.is_empty()) {
-            *sum += row as f32 * (wy[0].get() * footprint.spread(1) as f32);
-        }
-    }
-    sums.map(|sum| sum.round_ties_even() as i32)
-}
-
 fn render_sums<S: Sum>(
     frame: &Frame,
     bricks: &[Arc<Brick>],
     mut counters: Option<&mut WorkCounters>,
     add: impl Fn(&mut [[S; 4]], &Section<'_>),
-    down: impl Fn(&Footprint<'_>, &[Above<'_, S>], i32) -> [S; 4],
 ) -> Picture {
     let [w, h] = frame.view.size.map(|n| n as usize);
     let whole = Rect::from_size(frame.view.size);
@@ -205,15 +155,9 @@ fn render_sums<S: Sum>(
     let mut before = vec![[S::default(); 4]; whole.area()];
     let mut here = before.clone();
     let mut peek = before.clone();
-    // With a level camera, a row of sums for each lattice row.
-    let lattice_rows = frame.lattice_rows.as_ref();
-    let high = lattice_rows.map_or(0, LatticeRows::len);
-    let mut rows = [vec![[S::default(); 4]; w * high], vec![[S::default(); 4]; w * high]];
     for k in range.first..range.end {
         here.fill([S::default(); 4]);
         peek.fill([S::default(); 4]);
-        rows.iter_mut().for_each(|rows| rows.fill([S::default(); 4]));
-        let [here_rows, peek_rows] = &mut rows;
         for &v in &buckets[(k - range.first) as usize] {
             let (first, _, i, b) = voxels[v as usize];
             let brick = &bricks[b as usize];
@@ -226,11 +170,7 @@ fn render_sums<S: Sum>(
             let count = frame.sections.of(z).1.len() as i32;
             // Its section here, and the one behind: a voxel in this bucket begins no later than
             // this sheet, so what it puts into the next one is what the rule may peek at.
-            let lattice_row = frame.lattice_row(&frame.corner(brick.id), brick.index[i as usize]);
-            let to = match lattice_row {
-                Some(_) => [(k, &mut *here_rows), (k + 1, &mut *peek_rows)],
-                None => [(k, &mut here), (k + 1, &mut peek)],
-            };
+            let to = [(k, &mut here), (k + 1, &mut peek)];
             for (sheet, to) in to {
                 if sheet - first >= count {
                     continue;
@@ -238,29 +178,12 @@ fn render_sums<S: Sum>(
                 let Some(footprint) = frame.footprints.at(sheet) else { continue };
                 let at = frame.screen(&placed, sheet, &footprint);
                 let section = (sheet - first) as usize;
-                let part = Section { frame, z, section, payload, footprint, at, lattice_row };
+                let part = Section { frame, z, section, payload, footprint, at };
                 add(to, &part);
                 if let Some(counters) = counters.as_mut().filter(|_| sheet == k) {
                     for ([x, y], n) in part.rows() {
                         counters.add_section(Rect::new(x, y, x + n as i32, y + 1));
                     }
-                }
-            }
-        }
-        for (sheet, rows, to) in [(k, here_rows, &mut here), (k + 1, peek_rows, &mut peek)] {
-            let Some((lattice_rows, f)) = lattice_rows.zip(frame.footprints.at(sheet)) else {
-                continue;
-            };
-            for y in 0..h {
-                let covers = |s: &usize| {
-                    let (first, end) = f.extent(1, lattice_rows.at(&frame.view, *s, &f));
-                    first <= y as i32 && (y as i32) < end
-                };
-                let above: Vec<usize> = (0..high).filter(covers).collect();
-                for x in 0..w {
-                    let at = |&s: &usize| (lattice_rows.at(&frame.view, s, &f), &rows[s * w + x]);
-                    let above: Vec<Above<'_, S>> = above.iter().map(at).collect();
-                    to[y * w + x] = down(&f, &above, y as i32);
                 }
             }
         }

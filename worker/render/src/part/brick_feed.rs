@@ -332,11 +332,6 @@ impl<'a> ArrivingBricks<'a> {
         self.missing.borrow_mut().extend(missing.into_iter().map(|(_, place)| place));
     }
 
-    /// The first sheet at which any brick begins; `None` if nothing lies over the part.
-    pub(crate) fn nearest(&self) -> Option<i32> {
-        self.nearest
-    }
-
     /// Returns the number of bricks that were taken.
     pub(crate) fn taken_count(&self) -> usize {
         self.taken.len()

@@ -85,14 +85,6 @@ impl Default for Pixels {
 }
 
 impl Part<'_> {
-    /// The first sheet at which any brick begins; `None` without bricks.
-    pub(crate) fn nearest(&self) -> Option<i32> {
-        match self.bricks {
-            BrickSource::Here(_) => (!self.inside.is_empty()).then(|| self.first_sheet(0)),
-            BrickSource::Arriving(arriving) => arriving.nearest(),
-        }
-    }
-
     /// The first sheet of brick `i` of the part, front to back.
     #[inline(always)]
     pub(crate) fn first_sheet(&self, i: usize) -> i32 {

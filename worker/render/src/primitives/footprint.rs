@@ -22,7 +22,6 @@ use crate::primitives::field_taps::FieldTaps;
 use crate::primitives::profile_table::ProfileTable;
 use crate::primitives::sections::fixed;
 pub use crate::primitives::sections::{SLIVER, Sections};
-use crate::primitives::sizes::{LINE, MOST, SHEAR_COLUMNS, SHEAR_ROWS};
 use glam::DVec3;
 pub use slabcast_common::kernel::{Lean, Profile};
 use slabcast_common::quality::Kernel;
@@ -30,25 +29,6 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, View};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
-
-/// Shear of a view's sections: offsets of a voxel's sections from each other.
-#[derive(Clone, Copy, Debug)]
-#[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))] // Some of it is read in lanes alone.
-pub struct Slant<'a> {
-    /// Offsets of a voxel's sections along x and y, in subpixels: for each depth phase as many as
-    /// weights.
-    pub subpixels: [&'a [i32]; 2],
-    /// Layouts of the weights across and down.
-    pub(crate) phases: [Phases; 2],
-    /// Slope of x over y of the sheared kernel in units of 2^-16 ([`Lean::row_fixed`]): less than
-    /// 2^20 either way.
-    pub row: i32,
-    /// Whether the rows of a section are offset from each other across the picture.
-    pub skewed: bool,
-    /// Columns of a row that all sections of a voxel have together, at most: [`SHEAR_COLUMNS`], or
-    /// if they all have the same [`LINE`].
-    pub wide: usize,
-}
 
 /// Offsets of sections and rows of a kernel that leans ([`slabcast_common::kernel`]).
 #[derive(Debug)]
@@ -62,10 +42,6 @@ pub struct Leaning {
     row: i64,
     /// The farthest that any section lies aside.
     most: [f64; 2],
-    /// Pixels that a voxel's footprints lie apart at most: in a row, and down the picture.
-    apart: [i64; 2],
-    /// Whether each sheet's lies farther down, or farther up, than that of the one before.
-    steady: bool,
 }
 
 impl Leaning {
@@ -81,8 +57,7 @@ impl Leaning {
         let slopes =
             lean.depth.map(|slope| if shows(slope.abs() * deep.radius) { slope } else { 0.0 });
         let (aside, subpixels) = ([vec![], vec![]], [vec![], vec![]]);
-        let mut leaning =
-            Leaning { aside, subpixels, row, most: [0.0; 2], apart: [0; 2], steady: true };
+        let mut leaning = Leaning { aside, subpixels, row, most: [0.0; 2] };
         let mut behind = vec![0.0; sections.stride];
         for p in 0..sections.phases {
             let at = f64::from(p) / f64::from(sections.phases);
@@ -104,23 +79,6 @@ impl Leaning {
                 }
             }
         }
-        let [x, y] = leaning.subpixels.each_ref().map(|aside| aside.chunks(sections.stride));
-        for (x, y) in x.zip(y) {
-            leaning.steady &= y.is_sorted() || y.iter().rev().is_sorted();
-            // In one row of the picture. What is rounded once for a section may be otherwise in
-            // another.
-            let of_row =
-                x.iter().zip(y).map(|(&x, &y)| i64::from(x) + Lean::along_row(row, -i64::from(y)));
-            let across = between(of_row) + i64::from(row != 0);
-            let down = between(y.iter().map(|&y| i64::from(y)));
-            for (to, apart) in leaning.apart.iter_mut().zip([across, down]) {
-                // Two places that are hardly apart may lie on either side of where a footprint
-                // begins a pixel farther.
-                *to = (*to).max((apart >> SUBPIXEL_BITS) + 1);
-            }
-        }
-        // Sheets of a voxel at the end of the table are looked up together, there or not.
-        leaning.subpixels.iter_mut().for_each(|aside| aside.extend([0; MOST]));
         leaning
     }
 
@@ -136,29 +94,10 @@ impl Leaning {
     }
 
     /// Distance of sections beside their voxels along an axis, in subpixels; parallel views only.
-    /// [`Sections::most`] a phase, and [`MOST`] zeros at the end.
+    /// [`Sections::most`] a phase.
     #[inline(always)]
     pub(crate) fn subpixels(&self, axis: usize) -> &[i32] {
         &self.subpixels[axis]
-    }
-
-    /// Returns the offsets of voxels' sections from each other; `None` if sections spread over more
-    /// rows or columns than are added at once.
-    pub fn slant(&self, phases: [Phases; 2]) -> Option<Slant<'_>> {
-        let [x, down] = &phases;
-        let skewed = self.row != 0;
-        if !skewed && self.most[0] > 0.0 {
-            // Columns of their own that are the same in all rows.
-            return None;
-        }
-        let wide = x.len as i64 + if skewed { self.apart[0] } else { 0 };
-        let fits = wide <= if skewed { SHEAR_COLUMNS } else { LINE } as i64
-            && down.len as i64 + self.apart[1] <= SHEAR_ROWS as i64
-            && (skewed || self.steady)
-            && self.row.abs() < 1 << 20;
-        let subpixels = self.subpixels.each_ref().map(Vec::as_slice);
-        let (row, wide) = (self.row as i32, wide as usize);
-        fits.then_some(Slant { subpixels, phases, row, skewed, wide })
     }
 
     /// Pixels at most along x and y that a section or an outermost row lies beside its voxel, for
@@ -169,23 +108,11 @@ impl Leaning {
         [x + row.abs() * f64::from(reach + 1), y]
     }
 
-    /// The farthest of [those](Leaning::aside).
-    #[inline(always)]
-    pub(crate) fn most(&self, axis: usize) -> f64 {
-        self.most[axis]
-    }
-
     /// How far the middle of a row moves along x for each row, in units of 2^-16.
     #[inline(always)]
     pub(crate) fn row(&self) -> i64 {
         self.row
     }
-}
-
-/// How far the least and the greatest of some numbers are from each other.
-fn between(all: impl Iterator<Item = i64>) -> i64 {
-    let (least, most) = all.fold((i64::MAX, i64::MIN), |(a, b), n| (a.min(n), b.max(n)));
-    most.saturating_sub(least).max(0)
 }
 
 /// Footprint weights along one screen axis for one scale, by subpixel phase.
@@ -205,10 +132,6 @@ struct AxisTable {
     /// Pixels that a footprint reaches at most from the one that holds its centre.
     reach: i32,
 }
-
-/// Zeros before and behind a phase's weights, if there are any: as many as these, and so many at
-/// least.
-type Zeros = Option<usize>;
 
 /// Pixels that a footprint covers along one axis: `[first, last]` for a centre at phase `p`.
 fn reach(p: i32, radius_px: f64) -> (i64, i64) {
@@ -274,12 +197,6 @@ impl Phases {
         self.first.of(p)
     }
 
-    /// Returns the first pixel of a footprint at `place`, in subpixels; both count from one corner.
-    #[inline(always)]
-    pub fn first_at(&self, place: i32) -> i32 {
-        (place >> SUBPIXEL_BITS) + self.first(place & (SUBPIXELS - 1))
-    }
-
     /// The phase from which on the first pixel is one farther.
     #[inline(always)]
     pub(crate) fn more_from(&self) -> i32 {
@@ -294,8 +211,9 @@ impl Phases {
 }
 
 impl AxisTable {
-    /// Weights of `profile` at `scale`, with [`Zeros`] around each phase's.
-    fn new(profile: &Profile, scale: f64, zeros: Zeros, field: bool) -> Self {
+    /// Weights of `profile` at `scale`; `padded` puts as many zeros before and behind those of each
+    /// phase.
+    fn new(profile: &Profile, scale: f64, padded: bool, field: bool) -> Self {
         let radius = profile.radius * scale;
         let spans: Vec<(i64, i64)> = (0..SUBPIXELS).map(|p| reach(p, radius)).collect();
         let firsts: Vec<i32> = spans.iter().map(|s| near(s.0)).collect();
@@ -304,7 +222,7 @@ impl AxisTable {
         debug_assert!((0..SUBPIXELS).zip(&firsts).all(|(p, want)| first.of(p) == *want));
         let count: Vec<u32> = spans.iter().map(|s| (s.1 - s.0 + 1).max(0) as u32).collect();
         let stride = count.iter().copied().max().unwrap_or(0) as usize;
-        let margin = zeros.map_or(0, |least| stride.max(least));
+        let margin = if padded { stride } else { 0 };
         let far = |s: &(i64, i64)| near((-s.0).max(s.1));
         let reach = spans.iter().map(far).max().unwrap_or(0);
         let n = (stride + 2 * margin) * SUBPIXELS as usize;
@@ -358,8 +276,8 @@ struct Tables {
 }
 
 impl Tables {
-    fn new(x: &Profile, y: &Profile, scale: f64, zeros: Zeros, field: bool) -> Self {
-        let along = |profile| AxisTable::new(profile, scale, zeros, field);
+    fn new(x: &Profile, y: &Profile, scale: f64, padded: bool, field: bool) -> Self {
+        let along = |profile| AxisTable::new(profile, scale, padded, field);
         Tables { x: along(x), y: (x != y).then(|| along(y)) }
     }
 
@@ -381,7 +299,6 @@ pub struct Footprints {
     /// orthographic view; none where they would be too large.
     tables: Vec<OnceLock<Arc<Tables>>>,
     first: i32,
-    last: i32,
     view: View,
     shelf: Arc<Shelf>,
     /// Whether tables have the weights of a field's four channels.
@@ -404,8 +321,9 @@ type Cut = ([u64; 2], bool);
 /// A profile and a thickness, as bits, phases of a sheet, and whether slivers are given away.
 type Deep = ([u64; 4], i32, bool);
 
-/// Two profiles and a scale, as bits, zeros around weights, and whether there are those of fields.
-type Key = ([u64; 7], Zeros, bool);
+/// Two profiles and a scale, as bits, whether weights have zeros around them, and whether there are
+/// those of fields.
+type Key = ([u64; 7], bool, bool);
 
 /// Tables that a shelf keeps: some 1000 are 14 MB at two pixels a vox. A turn of a volume of 256
 /// voxels a side has 450. A shelf that is full is cleared: what frames use they hold themselves.
@@ -422,11 +340,11 @@ fn rounded(scale: f64) -> f64 {
 }
 
 impl Shelf {
-    fn get(&self, [x, y]: [&Profile; 2], scale: f64, zeros: Zeros, field: bool) -> Arc<Tables> {
+    fn get(&self, [x, y]: [&Profile; 2], scale: f64, padded: bool, field: bool) -> Arc<Tables> {
         let profile = |p: &Profile| [p.std, p.radius, p.spread].map(f64::to_bits);
         let ([a, b, c], [d, e, f]) = (profile(x), profile(y));
-        let key = ([a, b, c, d, e, f, scale.to_bits()], zeros, field);
-        shelved(&self.tables, SHELF, key, || Tables::new(x, y, scale, zeros, field))
+        let key = ([a, b, c, d, e, f, scale.to_bits()], padded, field);
+        shelved(&self.tables, SHELF, key, || Tables::new(x, y, scale, padded, field))
     }
 
     /// Returns [`Sections::new`] from the shelf, made once: it takes 80 us, which is a twentieth of
@@ -516,28 +434,21 @@ impl Footprints {
         let bytes = taps * f64::from(SUBPIXELS) * 6.0 * axes * sheets as f64;
         let kept = taps <= TABLE_TAPS && bytes <= TABLE_BYTES;
         let tables = (0..if kept { sheets } else { 0 }).map(|_| OnceLock::new()).collect();
-        let (first, last) = (range.first, range.end - 1);
-        Footprints { x, y, tables, first, last, view: *view, shelf, field }
-    }
-
-    /// The last sheet that anything of the volume may reach.
-    pub(crate) fn last(&self) -> i32 {
-        self.last
+        let first = range.first;
+        Footprints { x, y, tables, first, view: *view, shelf, field }
     }
 
     /// Returns the footprint of voxels in sheet `k`; `None` where the near plane clips the sheet.
     #[inline]
     pub fn at(&self, k: i32) -> Option<Footprint<'_>> {
         let scale = self.view.scale_at(k)?;
-        // Where one table serves all sheets, windows are moved to lie inside a part, or sections
-        // lie aside of each other.
-        let least = if self.view.kernel_lean.is_none() { 0 } else { SHEAR_ROWS };
-        let (slot, zeros) = match self.view.projection {
-            Projection::Ortho { .. } => (self.tables.first(), Some(least)),
-            Projection::Persp { .. } => (self.tables.get((k - self.first) as usize), None),
+        // Where one table serves all sheets, windows are moved to lie inside a part.
+        let (slot, padded) = match self.view.projection {
+            Projection::Ortho { .. } => (self.tables.first(), true),
+            Projection::Persp { .. } => (self.tables.get((k - self.first) as usize), false),
         };
         let wide = rounded(scale);
-        let make = || self.shelf.get([&self.x, &self.y], wide, zeros, self.field);
+        let make = || self.shelf.get([&self.x, &self.y], wide, padded, self.field);
         let table = slot.map(|t| &**t.get_or_init(make));
         Some(Footprint { scale, wide, table, profiles: [&self.x, &self.y] })
     }
@@ -561,11 +472,6 @@ impl<'a> Footprint<'a> {
     #[inline]
     pub fn reach(&self) -> Option<[i32; 2]> {
         self.table.map(|t| [t.along(0).reach, t.along(1).reach])
-    }
-
-    /// Length of a step of the lattice along `axis`, in vox.
-    pub(crate) fn spread(&self, axis: usize) -> f64 {
-        self.profiles[axis].spread
     }
 
     /// Returns the pixels `[first, end)` along `axis` (0: x, 1: y) that a footprint covers at

@@ -1,11 +1,10 @@
 //! Tables and positions that kernels and geometries share: tables of weights, integer positions,
-//! lattice rows, fixed sizes.
+//! fixed sizes.
 //!
 //! Imports nothing of this crate but itself.
 
 pub mod field_taps;
 pub mod footprint;
-pub mod lattice_rows;
 pub mod positions;
 pub mod profile_table;
 pub mod sections;

@@ -54,7 +54,7 @@ fn constant_volume_is_drawn_at_full_strength_up_to_its_faces() {
         let frame = Frame::new(Arc::new(Scene::new(&spec)), view);
         let picture = serial::render(&frame, &bricks_of(&volume));
         let depth = crop.map_or(f64::from(n), |crop| crop.hi.z - crop.lo.z);
-        let want = 1.0 - (1.0 - alpha).powf(depth);
+        let want = 1.0 - libm::pow(1.0 - alpha, depth);
         // Ends along x, in pixels: the first inside, and the last.
         let [left, right] = crop.map_or([24, 71], |_| [35, 71]);
         for (x, y, inside) in [

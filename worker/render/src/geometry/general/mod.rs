@@ -6,7 +6,7 @@
 
 mod planes;
 
-use self::planes::{BLOCK, Lofts, Planes, Window};
+use self::planes::{BLOCK, Planes, Window};
 use crate::kernels::composite::{LANES, Row};
 use crate::kernels::field::{FieldSum, Four, planes_of, weighted};
 use crate::kernels::pixel_records::STRIDE;
@@ -14,7 +14,6 @@ use crate::kernels::touched::put;
 use crate::kernels::{Accumulate, Simd, Weight, Work};
 use crate::part::{Io, Part, Pixels, keep_last};
 use crate::primitives::footprint::Footprint;
-use crate::primitives::lattice_rows::{LatticeRows, Reaching};
 use crate::primitives::sizes::PART;
 use crate::scene::Placed;
 use crate::visibility::open_mask::OpenMask;
@@ -48,29 +47,16 @@ pub(crate) struct Kinds {
     pub(crate) floats: Kind<f32>,
 }
 
-/// Lattice rows that reach a row of pixels, and in which sheet.
-type OfSheet<W> = (Option<i32>, Reaching<W>);
-
 /// Memory of a render thread for the sums of one number type.
 pub struct Kind<S: Accumulate> {
     planes: Planes<S>,
-    /// In level views, from which `planes` are filled when a sheet closes.
-    lofts: Lofts<S>,
     /// For weights that are in no table.
     weights: [Vec<S::Weight>; 2],
-    /// Lattice rows that reach each row of the part in a sheet, and in which: of even sheets and
-    /// odd ones.
-    reaching: [Vec<OfSheet<S::Weight>>; 2],
 }
 
 impl<S: Accumulate> Default for Kind<S> {
     fn default() -> Self {
-        Kind {
-            planes: Planes::default(),
-            lofts: Lofts::default(),
-            weights: [Vec::new(), Vec::new()],
-            reaching: [Vec::new(), Vec::new()],
-        }
+        Kind { planes: Planes::default(), weights: [Vec::new(), Vec::new()] }
     }
 }
 
@@ -110,29 +96,17 @@ impl Queues {
     }
 }
 
-/// Work that draws one part with any kernel, view and number type; it is compiled once for each
-/// instruction set.
-pub struct RenderGeneral<'a, S: Accumulate> {
-    pub(crate) part: Part<'a>,
-    pub(crate) kind: &'a mut Kind<S>,
-    pub(crate) queues: &'a mut Queues,
-    pub(crate) pixels: &'a mut Pixels,
-    pub(crate) io: Io<'a>,
-}
-
-impl<S: Accumulate> Work for RenderGeneral<'_, S> {
-    type Out = ();
-    #[inline(always)]
-    fn run(self, _: Simd) {
-        let RenderGeneral { part, kind, queues, pixels, io } = self;
-        let slots = part.frame.sections.most() + 1;
-        kind.planes.reset(slots);
-        if part.frame.lattice_rows.is_some() {
-            kind.lofts.reset(slots);
-            kind.reaching.iter_mut().for_each(Vec::clear);
-        }
-        General { part: &part }.render(SectionSums, kind, queues, pixels, io);
-    }
+/// Draws one part with any kernel, view and number type. It is compiled for the baseline alone:
+/// for other instruction sets it took as long (perspective views of mri256).
+pub(crate) fn render<S: Accumulate>(
+    part: &Part<'_>,
+    kind: &mut Kind<S>,
+    queues: &mut Queues,
+    pixels: &mut Pixels,
+    io: Io<'_>,
+) {
+    kind.planes.reset(part.frame.sections.most() + 1);
+    General { part }.render(SectionSums, kind, queues, pixels, io);
 }
 
 /// Work that draws one part of a field with any kernel and view.
@@ -328,13 +302,6 @@ impl General<'_> {
             contents.splat_all(self, &bucket, k, kind, (&open, counters));
             bucket.clear();
             queues.buckets[(k - slab.first) as usize] = bucket;
-            if let Some(lattice_rows) = &frame.lattice_rows {
-                // What the sheet behind has so far, if the colour rule peeks there.
-                for k in k..=k + i32::from(frame.looks_at_neighbours()) {
-                    self.fold(k, lattice_rows, kind, &open);
-                }
-                kind.lofts.clear(k);
-            }
             if self.close(&contents, k, &kind.planes, &mut open, pixels) {
                 any_open = open.count() > 0;
             }
@@ -348,7 +315,7 @@ impl General<'_> {
         }
         self.part.end(pixels, out);
         if let Some(last) = keep_last(part, stopped, out) {
-            // Nobody reads a shut pixel's sums; they may be anything, so they are none.
+            // The sums of a shut pixel are never read. They are handed on as zeros.
             self.part.each_pixel(|x, y, tile| {
                 if open.row(y) >> x & 1 == 1 {
                     last[tile] = kind.planes.raw(end - 1, y * PART as usize + x);
@@ -429,7 +396,7 @@ impl General<'_> {
         &self,
         bucket: &[Waiting],
         k: i32,
-        Kind { planes, lofts, weights, .. }: &mut Kind<S>,
+        Kind { planes, weights }: &mut Kind<S>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {
@@ -438,10 +405,8 @@ impl General<'_> {
         let rows = (rect.y0, rect.y1);
         // The sheet behind the slab is filled as far as the colour rule peeks.
         let end = slab.end + i32::from(frame.looks_at_neighbours());
-        // The first lattice row at the scale that was asked for last.
-        let mut based = (f64::NAN, 0);
         for Waiting { brick, voxel, placed } in bucket {
-            let (brick, corner) = self.part.brick(*brick as usize);
+            let (brick, _) = self.part.brick(*brick as usize);
             if frame.scene.quality.cull && self.extent(placed).is_none_or(|e| !open.any(&e)) {
                 counters.culled += 1;
                 continue;
@@ -457,20 +422,7 @@ impl General<'_> {
                 let at = frame.screen(placed, sheet, &f);
                 let i = (sheet - first) as usize;
                 let section = || S::section(&frame.sections, placed.z, i, &payload);
-                if let Some(lattice_rows) = &frame.lattice_rows {
-                    let (x0, wx) = S::Weight::of(&f, 0, at[0], (rect.x0, rect.x1), &mut weights[0]);
-                    if !wx.is_empty() {
-                        if based.0 != f.scale {
-                            based = (f.scale, lattice_rows.base(&frame.view, rect, f.scale));
-                        }
-                        let base = based.1;
-                        let lattice_row =
-                            frame.lattice_row(corner, brick.index[usize::from(*voxel)]);
-                        let lattice_row = lattice_row.expect("a level view") as i32;
-                        let columns = ((x0 - rect.x0) as usize, wx);
-                        lofts.add((sheet, base), lattice_row, columns, section());
-                    }
-                } else if leaning_rows {
+                if leaning_rows {
                     // Each lies elsewhere.
                     let (y0, y1) = f.extent(1, at[1]);
                     for y in y0.max(rows.0)..y1.min(rows.1) {
@@ -501,47 +453,6 @@ impl General<'_> {
         let inside = !wx.is_empty() && !wy.is_empty();
         let at = |p: i32, origin: i32| (p - origin) as usize;
         inside.then(|| ((at(x0, rect.x0), wx), (at(y0, rect.y0), wy)))
-    }
-
-    /// Fills the plane of sheet `k` from its lattice rows, where pixels are open.
-    #[inline(always)]
-    fn fold<S: Accumulate>(
-        &self,
-        k: i32,
-        lattice_rows: &LatticeRows,
-        Kind { planes, lofts, weights, reaching }: &mut Kind<S>,
-        open: &OpenMask,
-    ) {
-        let Part { frame, rect, .. } = self.part;
-        planes.clear(k);
-        let Some(f) = frame.footprints.at(k) else { return };
-        // In a parallel view all sheets are alike.
-        let like = if let Projection::Ortho { .. } = frame.view.projection { 0 } else { k };
-        let reaching = &mut reaching[like as usize % 2];
-        reaching.resize_with(rect.height(), Default::default);
-        for y in 0..rect.height() {
-            if open.row(y) == 0 {
-                continue;
-            }
-            let row = rect.y0 + y as i32;
-            let weight = |at| {
-                let weight = S::Weight::of(&f, 1, at, (row, row + 1), &mut weights[1]).1[0];
-                weight.of_rows(lattice_rows.spread)
-            };
-            let (of, reaching) = &mut reaching[y];
-            if of.replace(like) != Some(like) {
-                *reaching = lattice_rows.reaching(&frame.view, &f, row, weight);
-            }
-            let some = &reaching.some[..reaching.n];
-            let mut columns = lofts.touched(k, some) & open.row(y);
-            // Blocks of columns beside each other: in those to which nothing was added there is
-            // nothing.
-            while columns != 0 {
-                let x = columns.trailing_zeros() as usize / BLOCK * BLOCK;
-                columns &= !(0xff << x);
-                planes.set(k, [x, y], &lofts.down(k, x, some));
-            }
-        }
     }
 
     /// Closes sheet `k` where it was touched; whether pixels were shut.

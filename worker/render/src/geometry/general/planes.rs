@@ -4,7 +4,6 @@
 use crate::kernels::composite::Row;
 use crate::kernels::field::{FieldSum, Four, weighted};
 use crate::kernels::{Accumulate, Pixels, splat};
-use crate::primitives::sizes::LATTICE_ROWS as ROWS;
 use slabcast_common::image::RawSums;
 
 /// Pixels of a part's row, and rows of a part.
@@ -41,132 +40,6 @@ impl Touched {
     #[inline(always)]
     fn slot(&self, k: i32) -> usize {
         k.rem_euclid(self.slots) as usize
-    }
-}
-
-/// Rows of lattice rows in the open sheets of a level view's part
-/// ([`crate::primitives::lattice_rows`]).
-#[derive(Default)]
-pub(crate) struct Lofts<S> {
-    sheets: Vec<Loft<S>>,
-}
-
-/// Lattice rows of one sheet.
-struct Loft<S> {
-    /// The sheet, and the lattice row that row 0 stands for.
-    k: i32,
-    base: i32,
-    rows: Vec<[S; 4]>,
-    /// By row, columns that something was added to.
-    touched: [u64; ROWS],
-}
-
-impl<S: Accumulate> Lofts<S> {
-    /// Empties all and makes room for `slots`.
-    pub(crate) fn reset(&mut self, slots: usize) {
-        let empty = || Loft {
-            k: i32::MIN,
-            base: 0,
-            rows: vec![[S::default(); 4]; ROWS * PART],
-            touched: [0; ROWS],
-        };
-        self.sheets.resize_with(slots, empty);
-        self.sheets.iter_mut().for_each(Loft::clear);
-    }
-
-    #[inline(always)]
-    fn slot(&self, k: i32) -> usize {
-        k.rem_euclid(self.sheets.len() as i32) as usize
-    }
-
-    /// Adds one section of a voxel of `lattice row` to sheet `k`, whose row 0 is that of `base`.
-    #[inline(always)]
-    pub(crate) fn add(
-        &mut self,
-        (k, base): (i32, i32),
-        lattice_row: i32,
-        (x0, wx): (usize, &[S::Weight]),
-        section: [S::Section; 4],
-    ) {
-        let slot = self.slot(k);
-        let loft = &mut self.sheets[slot];
-        (loft.k, loft.base) = (k, base);
-        let row = lattice_row - base;
-        if !(0..ROWS as i32).contains(&row) {
-            // It reaches none of the part's pixels.
-            return;
-        }
-        let row = row as usize;
-        for (sums, &w) in loft.rows[row * PART + x0..][..wx.len()].iter_mut().zip(wx) {
-            for c in 0..4 {
-                sums[c] = sums[c].plus(section[c], w);
-            }
-        }
-        loft.touched[row] |= (u64::MAX >> (PART - wx.len())) << x0;
-    }
-
-    /// The columns of sheet `k` that any of these lattice rows were added to.
-    #[inline(always)]
-    pub(crate) fn touched<W>(&self, k: i32, lattice_rows: &[(i32, W)]) -> u64 {
-        let loft = &self.sheets[self.slot(k)];
-        if loft.k != k {
-            return 0;
-        }
-        let row =
-            |&(lattice_row, _): &(i32, W)| loft.touched.get((lattice_row - loft.base) as usize);
-        lattice_rows.iter().filter_map(row).fold(0, |all, touched| all | touched)
-    }
-
-    /// Returns the weighted sum of these lattice rows in the [`BLOCK`] columns of sheet `k` from
-    /// `x` on.
-    #[inline(always)]
-    pub(crate) fn down(
-        &self,
-        k: i32,
-        x: usize,
-        lattice_rows: &[(i32, S::Weight)],
-    ) -> [[S; 4]; BLOCK] {
-        let loft = &self.sheets[self.slot(k)];
-        let mut ways = [[S::Way::default(); 4]; BLOCK];
-        for &(lattice_row, wy) in lattice_rows {
-            let row = (lattice_row - loft.base) as usize;
-            let Some(row) = loft.rows.get(row * PART + x..).and_then(<[_]>::first_chunk) else {
-                continue;
-            };
-            let row: &[[S; 4]; BLOCK] = row;
-            for i in 0..BLOCK {
-                for c in 0..4 {
-                    ways[i][c] = S::on(ways[i][c], row[i][c], wy);
-                }
-            }
-        }
-        let mut sums = [[S::default(); 4]; BLOCK];
-        for i in 0..BLOCK {
-            for c in 0..4 {
-                sums[i][c] = S::end(ways[i][c]);
-            }
-        }
-        sums
-    }
-
-    /// Empties sheet `k`.
-    #[inline(always)]
-    pub(crate) fn clear(&mut self, k: i32) {
-        let slot = self.slot(k);
-        if self.sheets[slot].k == k {
-            self.sheets[slot].clear();
-        }
-    }
-}
-
-impl<S: Accumulate> Loft<S> {
-    fn clear(&mut self) {
-        for (row, touched) in self.rows.chunks_mut(PART).zip(&mut self.touched) {
-            if std::mem::take(touched) != 0 {
-                row.fill([S::default(); 4]);
-            }
-        }
-        self.k = i32::MIN;
     }
 }
 
@@ -220,14 +93,6 @@ impl<S: Accumulate> Planes<S> {
             }
             mask &= mask - 1;
         }
-    }
-
-    /// Puts sums of sheet `k` that came from lattice rows, from a block's first column on.
-    #[inline(always)]
-    pub(crate) fn set(&mut self, k: i32, [x, y]: [usize; 2], sums: &[[S; 4]; BLOCK]) {
-        let slot = self.touched.slot(k);
-        self.sheets[slot][y * PART + x..][..BLOCK].copy_from_slice(sums);
-        self.touched.masks[slot] |= 1 << (y / BLOCK * 8 + x / BLOCK);
     }
 
     /// Adds one section of a voxel to sheet `k`.

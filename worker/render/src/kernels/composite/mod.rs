@@ -9,7 +9,6 @@
 //! matter of the absolute sheet grid (docs/design/numerics.md, section 1.2).
 
 pub mod field;
-pub mod rows;
 
 use crate::kernels::truncate;
 use slabcast_common::math::{PHI_SERIES_BELOW, opacity, phi, phi_both};
@@ -19,8 +18,6 @@ use slabcast_common::quality::Compositing;
 pub trait Sum: Copy + Default + PartialEq {
     /// Whether sums are whole numbers below 2^31.
     const WHOLE: bool;
-    /// Whether the three colours are one: sums of the second and third are not looked at.
-    const GREY: bool = false;
     /// The sum as a number.
     fn value(self) -> f32;
     /// Bits of the sum, as it travels.
@@ -310,24 +307,16 @@ impl Rule {
     #[inline(always)]
     pub fn close_row<S: Sum>(&self, row: &mut Row, live: u32) -> u32 {
         use Compositing::{Constant, Linear, Paper};
-        match (self.compositing, S::WHOLE, S::GREY) {
-            (Linear, true, false) => self.close_lanes::<true, true, false, 3>(row, live),
-            (Linear, true, true) => self.close_lanes::<true, true, false, 1>(row, live),
-            (Linear, false, _) => self.close_lanes::<true, false, false, 3>(row, live),
-            (Constant, _, false) => self.close_lanes::<false, true, false, 3>(row, live),
-            (Constant, _, true) => self.close_lanes::<false, true, false, 1>(row, live),
-            (Paper, _, false) => self.close_lanes::<false, true, true, 3>(row, live),
-            (Paper, _, true) => self.close_lanes::<false, true, true, 1>(row, live),
+        match (self.compositing, S::WHOLE) {
+            (Linear, true) => self.close_lanes::<true, true, false>(row, live),
+            (Linear, false) => self.close_lanes::<true, false, false>(row, live),
+            (Constant, _) => self.close_lanes::<false, true, false>(row, live),
+            (Paper, _) => self.close_lanes::<false, true, true>(row, live),
         }
     }
 
     #[inline(always)]
-    fn close_lanes<
-        const LINEAR: bool,
-        const WHOLE: bool,
-        const PAPER: bool,
-        const COLOURS: usize,
-    >(
+    fn close_lanes<const LINEAR: bool, const WHOLE: bool, const PAPER: bool>(
         &self,
         row: &mut Row,
         live: u32,
@@ -370,7 +359,7 @@ impl Rule {
             a[i] += light[i] * sheet[i];
         }
         row.a = a;
-        for ch in 0..COLOURS {
+        for ch in 0..3 {
             let [here, before, behind] =
                 [&row.here, &row.before, &row.behind].map(|sums| &sums[ch + 1]);
             let out = &mut row.light[ch];
@@ -389,9 +378,6 @@ impl Rule {
                 }
                 out[i] = fixed_light(light[i] * of_sheet);
             }
-        }
-        if COLOURS == 1 {
-            row.light = [row.light[0]; 3];
         }
         let mut shut = 0;
         for i in 0..LANES {

@@ -154,16 +154,6 @@ impl Lanes for Four {
             let [low, high] = places;
             [vuzp1q_s32(low, high), vuzp2q_s32(low, high)]
         }
-        fn fours_on(from: *const u32) -> [int32x4_t; 4] {
-            // SAFETY: the caller has four times four numbers there.
-            let int32x4x4_t(a, b, c, d) = unsafe { vld4q_s32(from.cast()) };
-            [a, b, c, d]
-        }
-        fn pairs_on(from: *const u32) -> [int32x4_t; 2] {
-            // SAFETY: the caller has twice four numbers there.
-            let int32x4x2_t(a, b) = unsafe { vld2q_s32(from.cast()) };
-            [a, b]
-        }
         fn twos(from: [*const u32; 2], stride: usize, at: *const u32) -> [int32x4_t; 4] {
             let mut places = [vdupq_n_s32(0); 4];
             for (i, places) in places.iter_mut().enumerate() {

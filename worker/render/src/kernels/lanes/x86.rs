@@ -168,17 +168,6 @@ impl Lanes for Eight {
                 _mm256_castps_si256(_mm256_shuffle_ps::<0b11_01_11_01>(low, high)),
             ]
         }
-        fn fours_on(from: *const u32) -> [__m256i; 4] {
-            let mut places = [_mm256_setzero_si256(); 4];
-            for (i, places) in places.iter_mut().enumerate() {
-                // SAFETY: the caller has four times eight numbers there.
-                *places = unsafe {
-                    let [low, high] = [i, i + 4].map(|i| _mm_loadu_si128(from.add(4 * i).cast()));
-                    _mm256_set_m128i(high, low)
-                };
-            }
-            Eight::turned(places)
-        }
         fn pairs_on(from: *const u32) -> [__m256i; 2] {
             // SAFETY: the caller has twice eight numbers there.
             let [a, b] = unsafe { [_mm256_loadu_ps(from.cast()), _mm256_loadu_ps(from.add(8).cast())] };
@@ -378,26 +367,6 @@ impl Lanes for Sixteen {
             [
                 _mm512_castps_si512(_mm512_shuffle_ps::<0b10_00_10_00>(low, high)),
                 _mm512_castps_si512(_mm512_shuffle_ps::<0b11_01_11_01>(low, high)),
-            ]
-        }
-        fn fours_on(from: *const u32) -> [__m512i; 4] {
-            // SAFETY: the caller has four times sixteen numbers there.
-            let places = unsafe {
-                [
-                    _mm512_loadu_si512(from.cast()),
-                    _mm512_loadu_si512(from.add(16).cast()),
-                    _mm512_loadu_si512(from.add(32).cast()),
-                    _mm512_loadu_si512(from.add(48).cast()),
-                ]
-            };
-            // Places 0, 4, 8 and 12, and so on, one a quarter; then in order.
-            let [a, b, c, d] = Sixteen::turned(places);
-            let order = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
-            [
-                _mm512_permutexvar_epi32(order, a),
-                _mm512_permutexvar_epi32(order, b),
-                _mm512_permutexvar_epi32(order, c),
-                _mm512_permutexvar_epi32(order, d),
             ]
         }
         fn pairs_on(from: *const u32) -> [__m512i; 2] {

@@ -1,7 +1,7 @@
 //! Sifting and making ready with lanes: four (NEON), eight (AVX2) or sixteen (AVX-512) voxels at
 //! once, from one generic source.
 
-use super::{FlatBrick, Packing, Placing, Shape, Sieve, Sifted, TIER_BITS, TierOf, Tossing};
+use super::{Sieve, Sifted, Tossing};
 #[cfg(target_arch = "aarch64")]
 use crate::kernels::lanes::Four;
 use crate::kernels::lanes::Lanes;
@@ -15,40 +15,25 @@ use slabcast_common::shade::NO_NORMAL;
 use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
 use slabcast_common::volume::Samples;
 
-/// Compiles the two entry points for an instruction set. All functions that they call are inlined
-/// into them.
+/// Compiles [`Sieve::sift`] for an instruction set. All functions that it calls are inlined into it.
 macro_rules! compiled {
     ($name:ident, $features:literal, $lanes:ty) => {
-        pub(super) mod $name {
-            use super::*;
-
-            /// [`Sieve::sift_plain`] in lanes.
-            #[target_feature(enable = $features)]
-            pub(in super::super) fn sift<P: Placed<$lanes>>(
-                sieve: &Sieve<'_, P>,
-                brick: &Brick,
-                tossing: &mut Tossing,
-            ) -> Sifted {
-                // SAFETY: these are the instructions.
-                unsafe {
-                    match &brick.values {
-                        Samples::U8(v) => voxels::<$lanes, _, _>(sieve, brick, v, tossing),
-                        Samples::U16(v) => voxels::<$lanes, _, _>(sieve, brick, v, tossing),
-                        Samples::F32(v) => voxels::<$lanes, _, _>(sieve, brick, v, tossing),
-                    }
-                }
-            }
-
-            /// [`super::super::make_ready`] in lanes.
-            #[target_feature(enable = $features)]
-            pub(in super::super) fn make_ready(
-                sections: &Sections,
-                packing: Packing<'_>,
-                kept: usize,
-                tossing: &mut Tossing,
-            ) {
-                // SAFETY: these are the instructions.
-                unsafe { super::make_ready::<$lanes>(sections, packing, kept, tossing) }
+        #[target_feature(enable = $features)]
+        pub(super) fn $name(
+            sieve: &Sieve<'_>,
+            brick: &Brick,
+            across: &[Phases; 2],
+            tossing: &mut Tossing,
+        ) -> Sifted {
+            // SAFETY: this function is compiled for the instructions that the lanes need.
+            unsafe {
+                let sifted = match &brick.values {
+                    Samples::U8(v) => voxels::<$lanes, _>(sieve, brick, v, tossing),
+                    Samples::U16(v) => voxels::<$lanes, _>(sieve, brick, v, tossing),
+                    Samples::F32(v) => voxels::<$lanes, _>(sieve, brick, v, tossing),
+                };
+                make_ready::<$lanes>(sieve.sections, across, sifted.kept, tossing);
+                sifted
             }
         }
     };
@@ -61,85 +46,19 @@ compiled!(avx2, "avx2,popcnt,lzcnt,bmi1,bmi2", Eight);
 #[cfg(target_arch = "x86_64")]
 compiled!(avx512, "avx512f,avx512vl,avx512dq,avx512bw,popcnt,lzcnt,bmi1,bmi2", Sixteen);
 
-/// [`super::keep`] with local indices; AVX-512 does that while it sifts.
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,popcnt,lzcnt,bmi1,bmi2")]
-pub(super) fn keep_eight(tossing: &mut Tossing, n: usize, wanted: u32) -> usize {
-    // SAFETY: these are the instructions.
-    unsafe { keep::<Eight>(tossing, n, wanted) }
-}
-
-/// [`super::keep`] with local indices.
-#[cfg(target_arch = "aarch64")]
-#[target_feature(enable = "neon")]
-pub(super) fn keep_four(tossing: &mut Tossing, n: usize, wanted: u32) -> usize {
-    // SAFETY: these are the instructions.
-    unsafe { keep::<Four>(tossing, n, wanted) }
-}
-
+/// Returns x, y (subpixels) and depth (phases) of `L::LANES` voxels from index `local` on.
 #[inline(always)]
-unsafe fn keep<L: Lanes>(tossing: &mut Tossing, n: usize, wanted: u32) -> usize {
-    let Tossing { first, fate, cells, samples, normals, locals, .. } = tossing;
-    let mut kept = 0;
-    for from in (0..n.min(512)).step_by(L::LANES) {
-        let there = (1u64 << (n - from).min(L::LANES)) as u32 - 1;
-        // SAFETY: the caller's. Arrays have 512 numbers, a multiple of lanes; and as no more
-        // are kept than were gone through, what is stored lies where these lanes lay or in
-        // front.
-        unsafe {
-            let fate = L::load(fate.as_ptr().add(from));
-            let mark = L::bits(L::less(L::set(wanted as i32 - 1), fate)) & there;
-            let put = |of: *mut u32| {
-                let some = L::beside(mark, L::load(of.add(from)));
-                L::store(of.add(kept), some);
-            };
-            put(first.as_mut_ptr().cast());
-            for of in [&mut *cells, samples, normals, locals] {
-                put(of.as_mut_ptr());
-            }
-            kept += mark.count_ones() as usize;
-        }
-    }
-    kept
-}
-
-/// Positions of a brick's voxels, a register of them at a time.
-pub(super) trait Placed<L: Lanes>: Placing {
-    /// Returns x, y (subpixels) and depth (phases) of `L::LANES` voxels from index `local` on.
-    ///
-    /// # Safety
-    /// For machines with the instructions of `L`, as are all functions here.
-    unsafe fn some(&self, local: usize) -> [L::Ints; 3];
-}
-
-impl<L: Lanes> Placed<L> for FlatBrick<'_> {
-    #[inline(always)]
-    unsafe fn some(&self, local: usize) -> [L::Ints; 3] {
-        let [x, y, z] = self.places.offsets().each_ref();
-        let at = [x, y, z].map(|of| of[local..local + L::LANES].as_ptr());
-        let [x, y, z] = self.from;
-        // SAFETY: so many there are.
-        unsafe {
-            [
-                L::bits_of_sums(x, at[0], FINER_BITS),
-                L::bits_of_sums(y, at[1], FINER_BITS),
-                L::bits_of_sums(z, at[2], FINER_BITS),
-            ]
-        }
-    }
-}
-
-/// First pixels of footprints, and where weights begin.
-#[inline(always)]
-unsafe fn first<L: Lanes>(phases: &Phases, at: L::Ints) -> (L::Ints, L::Ints) {
-    let (near, more_from) = (phases.first(0), phases.more_from());
-    let (begin, stride) = (phases.begin(0) as i32, (phases.begin(1) - phases.begin(0)) as i32);
-    // SAFETY: the caller's.
+unsafe fn some<L: Lanes>(sieve: &Sieve<'_>, local: usize) -> [L::Ints; 3] {
+    let [x, y, z] = sieve.places.offsets().each_ref();
+    let at = [x, y, z].map(|of| of[local..local + L::LANES].as_ptr());
+    let [x, y, z] = sieve.from;
+    // SAFETY: the caller has the instructions; each slice above has so many offsets.
     unsafe {
-        let phase = L::and(at, L::set(SUBPIXELS - 1));
-        let first = L::plus(L::down(at, SUBPIXEL_BITS), L::set(near));
-        let first = L::one_more(L::less(L::set(more_from - 1), phase), first);
-        (first, L::plus(L::times(phase, L::set(stride)), L::set(begin)))
+        [
+            L::bits_of_sums(x, at[0], FINER_BITS),
+            L::bits_of_sums(y, at[1], FINER_BITS),
+            L::bits_of_sums(z, at[2], FINER_BITS),
+        ]
     }
 }
 
@@ -147,42 +66,24 @@ unsafe fn first<L: Lanes>(phases: &Phases, at: L::Ints) -> (L::Ints, L::Ints) {
 #[inline(always)]
 unsafe fn move_inside<L: Lanes>(phases: &Phases, at: L::Ints) -> (L::Ints, L::Ints) {
     let len = phases.len as i32;
-    // SAFETY: the caller's.
+    let (near, more_from) = (phases.first(0), phases.more_from());
+    let (begin, stride) = (phases.begin(0) as i32, (phases.begin(1) - phases.begin(0)) as i32);
+    // SAFETY: the caller has the instructions.
     unsafe {
-        let (first, from) = first::<L>(phases, at);
+        let phase = L::and(at, L::set(SUBPIXELS - 1));
+        let first = L::plus(L::down(at, SUBPIXEL_BITS), L::set(near));
+        let first = L::one_more(L::less(L::set(more_from - 1), phase), first);
+        let from = L::plus(L::times(phase, L::set(stride)), L::set(begin));
         let moved = L::min(L::max(first, L::set(0)), L::set(PART - len));
         let by = L::min(L::max(L::minus(moved, first), L::set(-len)), L::set(len));
         (moved, L::plus(from, by))
     }
 }
 
-/// Places in tiers, and where weights begin.
-#[inline(always)]
-unsafe fn in_tier<L: Lanes>(phases: &Phases, shape: &Shape, at: L::Ints) -> (L::Ints, L::Ints) {
-    let (none, last) = (shape.place(i32::MIN / 2), shape.place(i32::MAX / 2));
-    // SAFETY: the caller's.
-    unsafe {
-        let (first, from) = first::<L>(phases, at);
-        let place = L::plus(first, L::set(shape.margin as i32));
-        (L::min(L::max(place, L::set(none as i32)), L::set(last as i32)), from)
-    }
-}
-
-/// [`TierOf::at`] in lanes.
-#[inline(always)]
-unsafe fn tier_at<L: Lanes>(tier: &TierOf, rows: usize, y: L::Ints) -> L::Ints {
-    // SAFETY: the caller's.
-    unsafe {
-        let units = L::times(L::minus(y, L::set(tier.base)), L::set(tier.per));
-        let at = L::down(L::plus(units, L::set(1 << (TIER_BITS - 1))), TIER_BITS);
-        L::min(L::max(at, L::set(0)), L::set(rows as i32 - 1))
-    }
-}
-
 #[inline(always)]
 unsafe fn make_ready<L: Lanes>(
     sections: &Sections,
-    packing: Packing<'_>,
+    across: &[Phases; 2],
     kept: usize,
     tossing: &mut Tossing,
 ) {
@@ -193,16 +94,8 @@ unsafe fn make_ready<L: Lanes>(
         // SAFETY: as the line above shows; a voxel that is ready is four numbers.
         unsafe {
             let (x, y) = (L::load(x.as_ptr().add(i).cast()), L::load(y.as_ptr().add(i).cast()));
-            let [(x0, from_x), (y0, from_y)] = match packing {
-                Packing::Window([x_phases, y_phases]) => {
-                    [move_inside::<L>(x_phases, x), move_inside::<L>(y_phases, y)]
-                }
-                Packing::Aside => [(L::set(0), L::and(x, L::set(0xffff))), (L::set(0), y)],
-                Packing::Tier(phases, shape, tier) => [
-                    in_tier::<L>(phases, &shape, x),
-                    (tier_at::<L>(tier, shape.rows, y), L::set(0)),
-                ],
-            };
+            let (x0, from_x) = move_inside::<L>(&across[0], x);
+            let (y0, from_y) = move_inside::<L>(&across[1], y);
             let place = L::or(x0, L::up(y0, 8));
             let place = L::or(place, L::up(L::load(cells.as_ptr().add(i)), 16));
             let rows = L::or(from_x, L::up(from_y, 16));
@@ -246,15 +139,15 @@ impl Wide for f32 {
 }
 
 #[inline(always)]
-unsafe fn voxels<L: Lanes, T: Wide, P: Placed<L>>(
-    sieve: &Sieve<'_, P>,
+unsafe fn voxels<L: Lanes, T: Wide>(
+    sieve: &Sieve<'_>,
     brick: &Brick,
     values: &[T],
     tossing: &mut Tossing,
 ) -> Sifted {
-    let Sieve { places, open, cull, sections, sheets } = sieve;
+    let Sieve { open, cull, sections, sheets, .. } = sieve;
     let Tossing { at: [x_to, y_to, z_to], first: first_to, cells: cells_to, .. } = tossing;
-    let Tossing { samples: samples_to, normals: normals_to, locals: locals_to, .. } = tossing;
+    let Tossing { samples: samples_to, normals: normals_to, .. } = tossing;
     let (grown, reach) = open.grown();
     let (front, back, shift) = sections.reach();
     let (mut rank, mut reached, mut kept) = (0, 0, 0);
@@ -269,7 +162,7 @@ unsafe fn voxels<L: Lanes, T: Wide, P: Placed<L>>(
             let local = 64 * group + L::LANES * part;
             // SAFETY: the caller's, and what is said below.
             let mark = unsafe {
-                let [x, y, z] = places.some(local);
+                let [x, y, z] = some::<L>(sieve, local);
                 // In the slab's sheets, and near enough to the part.
                 let first = L::down(L::minus(z, L::set(front)), shift);
                 let behind = L::down(L::plus(z, L::set(back)), shift);
@@ -304,14 +197,9 @@ unsafe fn voxels<L: Lanes, T: Wide, P: Placed<L>>(
                 };
                 // No more are kept than were gone through, so as many lanes from there on are
                 // among an array's 512.
-                if P::KEPT {
-                    L::store(x_to.as_mut_ptr().add(kept).cast(), L::beside(mark, x));
-                    L::store(y_to.as_mut_ptr().add(kept).cast(), L::beside(mark, y));
-                    L::store(z_to.as_mut_ptr().add(kept).cast(), L::beside(mark, z));
-                } else {
-                    let local = L::beside(mark, L::from(local as i32));
-                    L::store(locals_to.as_mut_ptr().add(kept), local);
-                }
+                L::store(x_to.as_mut_ptr().add(kept).cast(), L::beside(mark, x));
+                L::store(y_to.as_mut_ptr().add(kept).cast(), L::beside(mark, y));
+                L::store(z_to.as_mut_ptr().add(kept).cast(), L::beside(mark, z));
                 L::store(first_to.as_mut_ptr().add(kept).cast(), L::beside(mark, first));
                 L::store(cells_to.as_mut_ptr().add(kept), L::beside(mark, cell));
                 L::store(samples_to.as_mut_ptr().add(kept), L::beside(mark, sample));

@@ -4,7 +4,7 @@
 //! exact). Code [`NO_NORMAL`] says that the gradient was zero or not finite; such voxels are drawn
 //! unshaded.
 
-use glam::{DVec3, Vec3};
+use glam::{DMat3, DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
 /// Normal code of a voxel without a gradient.
@@ -43,25 +43,73 @@ pub fn decode_normal(code: u16) -> Vec3 {
     Vec3::new(x * scale, y * scale, z * scale)
 }
 
-/// Direction that light comes from.
+/// Where light comes from.
+///
+/// With the normal n turned towards the eye, e the direction to the eye, l that to the light and h
+/// half-way between both, all of unit length, a base colour c becomes
+///
+/// ```text
+/// c (ambient + diffuse ((1 - fill) max(0, n.l) + fill max(0, n.e))) + specular max(0, n.h)^power
+/// ```
+///
+/// in linear light, clamped to `[0, 1]`. The fill is [`FILL`] for the key light and 0 for others.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
+#[serde(from = "WrittenLight", into = "WrittenLight")]
 pub enum Light {
-    /// From the eye (`"head"`).
-    Head(HeadWord),
+    /// From up left and in front, wherever the camera is ([`KEY`]), with a fill from the eye.
+    Key,
+    /// From the eye: l = e.
+    Head,
     /// From a direction in world axes, of any length.
     Direction([f64; 3]),
 }
 
-/// The word `head`, which stands for a head light in JSON.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub enum HeadWord {
-    /// `"head"`
-    #[serde(rename = "head")]
+/// Unit direction to the key light in eye axes (right, down, away): 41 degrees to the left of the
+/// eye, 33 above it. Light from up left is where people take it to come from who are not told, and
+/// where painters, photographers and map makers put it. From less far aside there is less relief:
+/// TODO.
+pub const KEY: [f64; 3] = [-6.0 / 11.0, -6.0 / 11.0, -7.0 / 11.0];
+
+/// Share of the key light's diffuse light that comes from the eye, so that nothing that faces the
+/// camera is black. TODO
+pub const FILL: f64 = 0.2;
+
+/// [`Light`] in JSON.
+#[derive(Serialize, Deserialize)]
+#[serde(untagged, expecting = "give \"key\", \"head\" or a direction [x, y, z] in world axes")]
+enum WrittenLight {
+    Word(LightWord),
+    Direction([f64; 3]),
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum LightWord {
+    Key,
     Head,
 }
 
-/// Ambient, Lambert and Blinn-Phong shading (docs/design/contracts.md, Colour and error).
+impl From<WrittenLight> for Light {
+    fn from(written: WrittenLight) -> Light {
+        match written {
+            WrittenLight::Word(LightWord::Key) => Light::Key,
+            WrittenLight::Word(LightWord::Head) => Light::Head,
+            WrittenLight::Direction(d) => Light::Direction(d),
+        }
+    }
+}
+
+impl From<Light> for WrittenLight {
+    fn from(light: Light) -> WrittenLight {
+        match light {
+            Light::Key => WrittenLight::Word(LightWord::Key),
+            Light::Head => WrittenLight::Word(LightWord::Head),
+            Light::Direction(d) => WrittenLight::Direction(d),
+        }
+    }
+}
+
+/// Ambient, Lambert and Blinn-Phong shading by the formula of [`Light`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Shading {
@@ -75,7 +123,7 @@ pub struct Shading {
     pub specular: f64,
     /// Exponent of the specular light, 0 to 10000; unitless.
     pub power: f64,
-    /// Direction of the light: from the eye, or fixed in the world.
+    /// Where the light is: fixed to the camera, or in the world.
     pub light: Light,
 }
 
@@ -83,11 +131,11 @@ impl Default for Shading {
     fn default() -> Self {
         Shading {
             on: true,
-            ambient: 0.2,
-            diffuse: 0.7,
+            ambient: 0.03,
+            diffuse: 0.9,
             specular: 0.1,
             power: 20.0,
-            light: Light::Head(HeadWord::Head),
+            light: Light::Key,
         }
     }
 }
@@ -160,33 +208,56 @@ impl Power {
     }
 }
 
-/// Shading made ready for many voxels: f32 factors, a unit light direction, the specular power.
+/// A light that is not at the eye, in one view.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Lamp {
+    /// Unit direction to the light.
+    pub to_light: Vec3,
+    /// Share of diffuse light that comes from the eye instead, 0 to 1.
+    pub fill: f32,
+}
+
+impl Lamp {
+    /// Returns the share of diffuse light on a normal with these cosines to the light and the eye.
+    #[inline(always)]
+    pub fn lambert(&self, n_light: f32, n_eye: f32) -> f32 {
+        (1.0 - self.fill) * n_light.max(0.0) + self.fill * n_eye.max(0.0)
+    }
+}
+
+/// Shading made ready for many voxels of one view: f32 factors, the light's direction, the
+/// specular power.
 #[derive(Clone, Debug)]
 pub struct Shader {
     ambient: f32,
     diffuse: f32,
     specular: f32,
-    /// Unit direction towards the light in world axes; `None` for a head light.
-    light: Option<Vec3>,
+    /// The light in world axes; `None` for a head light.
+    lamp: Option<Lamp>,
     power: Power,
 }
 
 impl Shader {
-    /// Builds a shader from `shading`, whose values must be valid.
-    pub fn new(shading: &Shading) -> Self {
-        let light = match shading.light {
-            Light::Head(_) => None,
-            Light::Direction(d) => {
-                let d = DVec3::from_array(d);
-                let d = d / d.length();
-                Some(Vec3::new(d.x as f32, d.y as f32, d.z as f32))
+    /// Builds a shader from `shading`, whose values must be valid, for views of a camera with these
+    /// axes ([`View::eye_from_world`](crate::view::View::eye_from_world)).
+    pub fn new(shading: &Shading, eye_from_world: &DMat3) -> Self {
+        let lamp = |d: DVec3, fill: f64| {
+            let d = d / d.length();
+            Lamp { to_light: Vec3::new(d.x as f32, d.y as f32, d.z as f32), fill: fill as f32 }
+        };
+        let lamp = match shading.light {
+            Light::Key => {
+                // A rotation: its inverse is its transpose.
+                Some(lamp(eye_from_world.transpose() * DVec3::from_array(KEY), FILL))
             }
+            Light::Head => None,
+            Light::Direction(d) => Some(lamp(DVec3::from_array(d), 0.0)),
         };
         Shader {
             ambient: shading.ambient as f32,
             diffuse: shading.diffuse as f32,
             specular: shading.specular as f32,
-            light,
+            lamp,
             power: Power::new(shading.power),
         }
     }
@@ -208,13 +279,14 @@ impl Shader {
         LightTerms { lambert: lit[0][0], gloss: lit[1][0] }
     }
 
-    /// Returns the unit direction towards the light in world axes; `None` for a head light.
-    pub fn light_direction(&self) -> Option<Vec3> {
-        self.light
+    /// Returns the light in world axes; `None` for a head light.
+    pub fn lamp(&self) -> Option<Lamp> {
+        self.lamp
     }
 
-    /// Turns the first `n` cosines between normals and the light into factors of base colours, and
-    /// those between normals and the half vector into what is added.
+    /// Turns the first `n` shares of diffuse light (the cosine to the light, or [`Lamp::lambert`])
+    /// into factors of base colours, and cosines between normals and the half vector into what is
+    /// added.
     #[inline(always)]
     pub fn terms<const MOST: usize>(
         &self,
@@ -243,7 +315,7 @@ impl Shader {
         let n = normals.len().min(MOST);
         let normals = &normals[..n];
         let [light, half] = lit;
-        match self.light {
+        match self.lamp {
             None => {
                 for i in 0..n {
                     let (normal, to_eye) = (decode_normal(normals[i]), to_eye(i));
@@ -254,7 +326,8 @@ impl Shader {
                     half[i] = light[i];
                 }
             }
-            Some(l) => {
+            Some(lamp) => {
+                let l = lamp.to_light;
                 for i in 0..n {
                     let (n, to_eye) = (decode_normal(normals[i]), to_eye(i));
                     let h = l + to_eye;
@@ -262,7 +335,8 @@ impl Shader {
                     let per_len = if len2 > 1e-12 { 1.0 / len2.sqrt() } else { 0.0 };
                     let n_eye = n.x * to_eye.x + n.y * to_eye.y + n.z * to_eye.z;
                     let side = if n_eye < 0.0 { -1.0 } else { 1.0 };
-                    light[i] = (n.x * l.x + n.y * l.y + n.z * l.z) * side;
+                    let n_light = (n.x * l.x + n.y * l.y + n.z * l.z) * side;
+                    light[i] = lamp.lambert(n_light, n_eye.abs());
                     half[i] = (n.x * h.x + n.y * h.y + n.z * h.z) * side * per_len;
                 }
             }

@@ -215,7 +215,7 @@ fn shading(a: &Shading, b: &Shading, t: f64) -> Shading {
             let v = unit(x) * (1.0 - t) + unit(y) * t;
             if v.length() > 1e-3 { Light::Direction(v.to_array()) } else { p.light }
         }
-        // Between a head light and a fixed one lies nothing: the nearer key's.
+        // Between lights of two kinds lies nothing: the nearer key's.
         (x, y) => {
             if t < 0.5 {
                 x

@@ -65,14 +65,22 @@ pub enum Light {
 }
 
 /// Unit direction to the key light in eye axes (right, down, away): 41 degrees to the left of the
-/// eye, 33 above it. Light from up left is where people take it to come from who are not told, and
-/// where painters, photographers and map makers put it. From less far aside there is less relief:
-/// TODO.
+/// eye and 33 above it, 50 from it in all.
+///
+/// People who aren't told take light to come from up left, and painters and map makers put it
+/// there. The angle is what photographers use for faces. Of a ball, 18 % of what is seen turn away
+/// from the light; at 36 degrees from the eye it is 9 % and pictures are flat, at 70 it is 33 %
+/// and half of the volume is in the dark.
 pub const KEY: [f64; 3] = [-6.0 / 11.0, -6.0 / 11.0, -7.0 / 11.0];
 
 /// Share of the key light's diffuse light that comes from the eye, so that nothing that faces the
-/// camera is black. TODO
-pub const FILL: f64 = 0.2;
+/// camera is black.
+///
+/// The shadow's side has this light and the ambient alone, so both decide how deep pictures look:
+/// greys at the 95th percentile are over those at the 5th (8-bit sRGB, pixels of the object) by
+/// 3.4 in a head, 3.1 in a skull, 3.4 in a brain and 3.1 in an engine block. A fill of 0.2 makes
+/// 2.8, 2.6, 2.8 and 2.5 of it; 0.06 leaves no shape in the shadow.
+pub const FILL: f64 = 0.12;
 
 /// [`Light`] in JSON.
 #[derive(Serialize, Deserialize)]
@@ -127,12 +135,15 @@ pub struct Shading {
     pub light: Light,
 }
 
+/// White that faces the key light gets 0.98 of its light: nothing is blown out but by the highlight.
+/// Ambient light counts in linear light: 0.2 of it would be half grey on the screen, and 0.02 is a
+/// seventh.
 impl Default for Shading {
     fn default() -> Self {
         Shading {
             on: true,
-            ambient: 0.03,
-            diffuse: 0.9,
+            ambient: 0.02,
+            diffuse: 1.0,
             specular: 0.1,
             power: 20.0,
             light: Light::Key,
@@ -421,27 +432,96 @@ mod tests {
         }
     }
 
+    /// The formula of [`Light`] in f64, in world axes; `n` and `e` of unit length.
+    fn formula(
+        s: &Shading,
+        eye_from_world: &DMat3,
+        base: [f64; 3],
+        [n, e]: [DVec3; 2],
+    ) -> [f64; 3] {
+        let n = if n.dot(e) < 0.0 { -n } else { n };
+        let (l, fill) = match s.light {
+            Light::Key => (eye_from_world.transpose() * DVec3::from_array(KEY), FILL),
+            Light::Head => (e, 0.0),
+            Light::Direction(d) => (DVec3::from_array(d).normalize(), 0.0),
+        };
+        let [n_l, n_e, n_h] = [l, e, (l + e).normalize()].map(|d| n.dot(d).max(0.0));
+        let diffuse = s.diffuse * ((1.0 - fill) * n_l + fill * n_e);
+        let gloss = s.specular * libm::pow(n_h, s.power);
+        base.map(|c| (c * (s.ambient + diffuse) + gloss).clamp(0.0, 1.0))
+    }
+
     #[test]
-    fn shading_is_the_formula_of_the_contract() {
-        let s = Shader::new(&Shading::default());
+    fn every_light_is_the_formula_from_all_sides() {
         let base = [0.5, 0.25, 1.0];
-        // Facing the eye: everything at full strength.
-        let lit = s.shade(base, encode_normal(DVec3::Z), Vec3::Z);
-        for c in 0..3 {
-            assert!((lit[c] - (base[c] * 0.9 + 0.1).min(1.0)).abs() < 1e-5);
+        let turned = DMat3::from_rotation_y(0.7) * DMat3::from_rotation_x(-1.9);
+        for light in [Light::Key, Light::Head, Light::Direction([0.0, -3.0, 2.0])] {
+            let shading = Shading { light, ambient: 0.1, power: 7.5, ..Shading::default() };
+            for eye_from_world in [DMat3::IDENTITY, turned] {
+                let shader = Shader::new(&shading, &eye_from_world);
+                for i in 0..200 {
+                    let at = f64::from(i);
+                    let normal = encode_normal(DVec3::new(
+                        libm::sin(at),
+                        libm::cos(at * 2.3),
+                        libm::sin(at * 1.7),
+                    ));
+                    let to_eye = DVec3::new(0.3 * libm::sin(at * 3.1), 0.2, -1.0).normalize();
+                    let to_eye = eye_from_world.transpose() * to_eye;
+                    let n = decode_normal(normal).as_dvec3();
+                    let want = formula(&shading, &eye_from_world, base, [n, to_eye]);
+                    let got = shader.shade(base.map(|c| c as f32), normal, to_eye.as_vec3());
+                    for c in 0..3 {
+                        let off = (f64::from(got[c]) - want[c]).abs();
+                        assert!(off < 1e-4, "{light:?} on {n}: {} for {}", got[c], want[c]);
+                    }
+                }
+                let unlit = base.map(|c| c as f32);
+                assert_eq!(shader.shade(unlit, NO_NORMAL, Vec3::Z), unlit);
+            }
         }
-        // Facing away is the same: two-sided.
-        assert_eq!(lit, s.shade(base, encode_normal(-DVec3::Z), Vec3::Z));
-        // Edge on: ambient alone.
-        let edge = s.shade(base, encode_normal(DVec3::X), Vec3::Z);
-        assert!((edge[0] - 0.1).abs() < 1e-5);
-        // 60 degrees off, light from the side.
-        let side = Shading { light: Light::Direction([0.0, 0.0, 2.0]), ..Shading::default() };
-        let to_eye = Vec3::new(0.8660254, 0.0, 0.5);
-        let got = Shader::new(&side).shade(base, encode_normal(DVec3::Z), to_eye);
-        let half = (1.0 + 0.5) / ((1.0f64 + 0.5).powi(2) + 0.75).sqrt();
-        let want = 0.5 * (0.2 + 0.7) + 0.1 * half.powi(20);
-        assert!((got[0] as f64 - want).abs() < 2e-4, "{} against {want}", got[0]);
-        assert_eq!(s.shade(base, NO_NORMAL, Vec3::Z), base);
+    }
+
+    #[test]
+    fn key_light_falls_from_up_left_and_fills_what_turns_away_from_it() {
+        let s = Shading::default();
+        let shader = Shader::new(&s, &DMat3::IDENTITY);
+        let lambert = |n: DVec3| f64::from(shader.light_terms(encode_normal(n), -Vec3::Z).lambert);
+        let near = |got: f64, want: f64| assert!((got - want).abs() < 1e-5, "{got} for {want}");
+        // Facing the eye, whichever side of the surface.
+        for n in [-DVec3::Z, DVec3::Z] {
+            near(lambert(n), s.ambient + s.diffuse * ((1.0 - FILL) * 7.0 / 11.0 + FILL));
+            let gloss = shader.light_terms(encode_normal(n), -Vec3::Z).gloss;
+            // The half vector is at an angle with the square of its cosine (1 + 7/11) / 2.
+            near(gloss.into(), s.specular * (9.0f64 / 11.0).powi(10));
+        }
+        // To the left and the right, up and down, by as much towards the eye.
+        let facing = |x: f64, y: f64| lambert(DVec3::new(x, y, -1.0));
+        let share = |cosine: f64| (1.0 - FILL) * cosine + FILL;
+        let root = 0.5f64.sqrt();
+        near(facing(-1.0, 0.0), s.ambient + s.diffuse * root * share(13.0 / 11.0));
+        near(facing(1.0, 0.0), s.ambient + s.diffuse * root * share(1.0 / 11.0));
+        assert_eq!(facing(-1.0, 0.0), facing(0.0, -1.0));
+        // Down right the light is behind: the fill is left.
+        let third = (1.0f64 / 3.0).sqrt();
+        assert!((facing(1.0, 1.0) - (s.ambient + s.diffuse * FILL * third)).abs() < 2e-3);
+        // Edge on and away from the light: ambient alone.
+        near(lambert(DVec3::X), s.ambient);
+    }
+
+    #[test]
+    fn lights_have_words_in_json() {
+        for (light, json) in [
+            (Light::Key, "\"key\""),
+            (Light::Head, "\"head\""),
+            (Light::Direction([1.0, 0.0, -2.5]), "[1.0,0.0,-2.5]"),
+        ] {
+            assert_eq!(serde_json::to_string(&light).unwrap(), json);
+            assert_eq!(serde_json::from_str::<Light>(json).unwrap(), light);
+        }
+        for bad in ["\"sun\"", "[1,2]", "3", "null"] {
+            let said = serde_json::from_str::<Light>(bad).unwrap_err().to_string();
+            assert!(said.contains("\"key\", \"head\""), "{bad}: {said}");
+        }
     }
 }

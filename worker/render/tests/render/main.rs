@@ -21,6 +21,7 @@ mod general;
 mod geometry_reach;
 mod kernels;
 mod lattice_rows;
+mod light;
 mod lut;
 mod on_paper;
 mod open_mask;

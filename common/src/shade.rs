@@ -69,8 +69,8 @@ pub enum Light {
 ///
 /// People who aren't told take light to come from up left, and painters and map makers put it
 /// there. The angle is what photographers use for faces. Of a ball, 18 % of what is seen turn away
-/// from the light; at 36 degrees from the eye it is 9 % and pictures are flat, at 70 it is 33 %
-/// and half of the volume is in the dark.
+/// from the light. At 36 degrees from the eye it is 9 % and relief is fainter, at 70 it is 33 % and
+/// a third of a picture is in shadow.
 pub const KEY: [f64; 3] = [-6.0 / 11.0, -6.0 / 11.0, -7.0 / 11.0];
 
 /// Share of the key light's diffuse light that comes from the eye, so that nothing that faces the
@@ -136,7 +136,7 @@ pub struct Shading {
     pub light: Light,
 }
 
-/// White that faces the key light gets 0.98 of its light: nothing is blown out but by the highlight.
+/// White gets at most 0.98 of ambient and diffuse key light: only the highlight can blow it out.
 /// Ambient light counts in linear light: 0.2 of it would be half grey on the screen, and 0.02 is a
 /// seventh.
 impl Default for Shading {

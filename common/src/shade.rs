@@ -488,7 +488,8 @@ mod tests {
         let s = Shading::default();
         let shader = Shader::new(&s, &DMat3::IDENTITY);
         let lambert = |n: DVec3| f64::from(shader.light_terms(encode_normal(n), -Vec3::Z).lambert);
-        let near = |got: f64, want: f64| assert!((got - want).abs() < 1e-5, "{got} for {want}");
+        // Slanted normals are rounded to a degree.
+        let near = |got: f64, want: f64| assert!((got - want).abs() < 0.01, "{got} for {want}");
         // Facing the eye, whichever side of the surface.
         for n in [-DVec3::Z, DVec3::Z] {
             near(lambert(n), s.ambient + s.diffuse * ((1.0 - FILL) * 7.0 / 11.0 + FILL));
@@ -502,10 +503,10 @@ mod tests {
         let root = 0.5f64.sqrt();
         near(facing(-1.0, 0.0), s.ambient + s.diffuse * root * share(13.0 / 11.0));
         near(facing(1.0, 0.0), s.ambient + s.diffuse * root * share(1.0 / 11.0));
-        assert_eq!(facing(-1.0, 0.0), facing(0.0, -1.0));
+        near(facing(0.0, -1.0), facing(-1.0, 0.0));
         // Down right the light is behind: the fill is left.
         let third = (1.0f64 / 3.0).sqrt();
-        assert!((facing(1.0, 1.0) - (s.ambient + s.diffuse * FILL * third)).abs() < 2e-3);
+        near(facing(1.0, 1.0), s.ambient + s.diffuse * FILL * third);
         // Edge on and away from the light: ambient alone.
         near(lambert(DVec3::X), s.ambient);
     }

@@ -131,7 +131,9 @@ pub fn transfer() -> impl Strategy<Value = TransferFunction> {
             Just(Light::Key),
             Just(Light::Head),
             [0.5..2.0f64, -2.0..2.0, -2.0..2.0].prop_map(Light::Direction),
-        ],
+        ]
+        // Without it a thread of tests has too small a stack for messages that hold this.
+        .boxed(),
     )
         .prop_map(|(mut colors, mut opacities, mut gradients, (yes, ambient, nan), light)| {
             colors.sort_by(|a, b| a.0.total_cmp(&b.0));

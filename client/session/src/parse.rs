@@ -1,7 +1,7 @@
 //! Values of flags: from text to what is meant, or what to give instead.
 
 use slabcast_common::image::Background;
-use slabcast_common::shade::{HeadWord, Light};
+use slabcast_common::shade::Light;
 use slabcast_common::transfer::NanColour;
 use slabcast_common::view::MAX_EDGE;
 use slabcast_scene::path::MAX_FRAMES;
@@ -429,15 +429,21 @@ pub fn frames(text: &str) -> Result<Frames, String> {
     }
 }
 
-/// Parses `head` or a direction `X,Y,Z`.
+/// Parses `key`, `head` or a direction `X,Y,Z`.
 ///
 /// # Errors
 /// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn light(text: &str) -> Result<Light, String> {
-    if text == "head" {
-        return Ok(Light::Head(HeadWord::Head));
+    match text {
+        "key" => return Ok(Light::Key),
+        "head" => return Ok(Light::Head),
+        _ => {}
     }
-    let bad = || "give head, or a direction X,Y,Z in world axes that is not zero".to_string();
+    let bad = || {
+        "give key (up left of the camera), head (at the eye), or a direction X,Y,Z in world axes \
+         that is not zero"
+            .to_string()
+    };
     let parts: Vec<f64> =
         text.split(',').map(number).collect::<Result<_, _>>().map_err(|_| bad())?;
     match parts[..] {
@@ -506,10 +512,12 @@ mod tests {
 
     #[test]
     fn light_and_nan_are_said_in_words_and_numbers() {
-        assert_eq!(light("head"), Ok(Light::Head(HeadWord::Head)));
+        assert_eq!(light("key"), Ok(Light::Key));
+        assert_eq!(light("head"), Ok(Light::Head));
         assert_eq!(light("-1,0,2.5"), Ok(Light::Direction([-1.0, 0.0, 2.5])));
         for bad in ["", "0,0,0", "1,2", "1,2,3,4", "nan,0,0", "up"] {
-            assert!(light(bad).is_err(), "{bad}");
+            let said = light(bad).unwrap_err();
+            assert!(["key", "head", "X,Y,Z"].iter().all(|c| said.contains(c)), "{bad}: {said}");
         }
         assert_eq!(nan("1,0,0").map(|n| n.opacity), Ok(1.0));
         assert_eq!(nan("#ff0000:0.25").map(|n| (n.color, n.opacity)), Ok(([1.0, 0.0, 0.0], 0.25)));

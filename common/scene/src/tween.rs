@@ -215,7 +215,7 @@ fn shading(a: &Shading, b: &Shading, t: f64) -> Shading {
             let v = unit(x) * (1.0 - t) + unit(y) * t;
             if v.length() > 1e-3 { Light::Direction(v.to_array()) } else { p.light }
         }
-        // Between a head light and a fixed one lies nothing: the nearer key's.
+        // Between lights of two kinds lies nothing: the nearer key's.
         (x, y) => {
             if t < 0.5 {
                 x
@@ -334,12 +334,21 @@ mod tests {
     #[test]
     fn tween_fades_lighting_in() {
         let t = tween(&names(&["fog", "bone"]));
-        let s = t.transfer_at(5.0).shading;
-        assert!(
-            s.on && (s.ambient - 0.6).abs() < 1e-12 && (s.diffuse - 0.35).abs() < 1e-12,
-            "{s:?}"
-        );
+        let (s, d) = (t.transfer_at(5.0).shading, Shading::default());
+        let half = [(s.ambient, (1.0 + d.ambient) / 2.0), (s.diffuse, d.diffuse / 2.0)];
+        assert!(s.on && half.iter().all(|(got, want)| (got - want).abs() < 1e-12), "{s:?}");
         assert!(!t.transfer_at(0.0).shading.on);
+    }
+
+    #[test]
+    fn tween_between_lights_of_two_kinds_jumps_half_way() {
+        let lights = [Light::Key, Light::Head, Light::Direction([0.0, 0.0, 1.0])];
+        for (a, b) in [(0, 1), (1, 2), (2, 0)].map(|(a, b)| (lights[a], lights[b])) {
+            let of = |light| Shading { light, ..Shading::default() };
+            assert_eq!(shading(&of(a), &of(b), 0.4).light, a);
+            assert_eq!(shading(&of(a), &of(b), 0.6).light, b);
+            assert_eq!(shading(&of(a), &of(a), 0.3).light, a);
+        }
     }
 
     #[test]

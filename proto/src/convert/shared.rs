@@ -9,7 +9,7 @@ use crate::convert::numbers::finite_all;
 use crate::convert::{WireError, enum_conversions};
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::quality::{Classify, Compositing, Kernel, Quality, Splat, Sums};
-use slabcast_common::shade::{HeadWord, Light, Shading};
+use slabcast_common::shade::{Light, Shading};
 use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::volume::SampleKind;
 
@@ -160,7 +160,8 @@ pub(super) fn transfer_to_wire(tf: &TransferFunction) -> wire::TransferFunction 
             specular: Some(s.specular),
             power: Some(s.power),
             light: Some(match s.light {
-                Light::Head(HeadWord::Head) => wire::shading::Light::Head(wire::Headlight {}),
+                Light::Key => wire::shading::Light::Key(wire::Keylight {}),
+                Light::Head => wire::shading::Light::Head(wire::Headlight {}),
                 Light::Direction(d) => wire::shading::Light::Direction(vec3_to_wire(d)),
             }),
         }),
@@ -196,7 +197,8 @@ pub(super) fn transfer_from_wire(
             power: s.power.unwrap_or(d.power),
             light: match s.light {
                 None => d.light,
-                Some(wire::shading::Light::Head(wire::Headlight {})) => Light::Head(HeadWord::Head),
+                Some(wire::shading::Light::Key(wire::Keylight {})) => Light::Key,
+                Some(wire::shading::Light::Head(wire::Headlight {})) => Light::Head,
                 Some(wire::shading::Light::Direction(v)) => {
                     Light::Direction(vec3_from_wire("shading.direction", v)?)
                 }

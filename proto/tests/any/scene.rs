@@ -127,8 +127,14 @@ pub fn transfer() -> impl Strategy<Value = TransferFunction> {
         vec((number(), unit(), unit(), unit()), 1..8),
         vec((number(), unit()), 1..8),
         vec((unit(), unit()), 0..4),
-        (any::<[bool; 4]>(), unit(), [unit(), unit(), unit(), unit()]),
-        [0.5..2.0f64, -2.0..2.0, -2.0..2.0],
+        (any::<[bool; 3]>(), unit(), [unit(), unit(), unit(), unit()]),
+        prop_oneof![
+            Just(Light::Key),
+            Just(Light::Head),
+            [0.5..2.0f64, -2.0..2.0, -2.0..2.0].prop_map(Light::Direction),
+        ]
+        // Without it a thread of tests has too small a stack for messages that hold this.
+        .boxed(),
     )
         .prop_map(|(mut colors, mut opacities, mut gradients, (yes, ambient, nan), light)| {
             colors.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -148,12 +154,7 @@ pub fn transfer() -> impl Strategy<Value = TransferFunction> {
                 },
                 nan: NanColour { color: [nan[0], nan[1], nan[2]], opacity: nan[3] },
                 gradient_opacity: gradients.into_iter().map(|(g, a)| [g, a]).collect(),
-                shading: Shading {
-                    on: yes[0],
-                    ambient,
-                    light: if yes[3] { Light::Direction(light) } else { shading.light },
-                    ..shading
-                },
+                shading: Shading { on: yes[0], ambient, light, ..shading },
             }
         })
 }

@@ -14,7 +14,7 @@ use slabcast_common::brick::{Brick, BrickGrid, TightBox, local_position};
 use slabcast_common::ids::BrickId;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Classify, Compositing, Quality, Sums};
-use slabcast_common::shade::{LightTerms, NO_NORMAL, Shader};
+use slabcast_common::shade::{LightTerms, NO_NORMAL, Shader, Shading};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::Classifier;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, View};
@@ -27,8 +27,8 @@ use std::sync::Arc;
 pub struct Scene {
     /// Table of extinction (per vox) and colour (linear, 0 to 1) by sample code.
     pub classifier: Classifier,
-    /// Lighting of voxels; `None` where voxels are unlit.
-    pub shader: Option<Shader>,
+    /// Light on voxels; [`Frame::shader`] is made of it.
+    pub shading: Shading,
     /// Quality of the pictures, with [`Sums::Auto`] resolved.
     pub quality: Quality,
     /// The volume's division into bricks of 8x8x8 voxels.
@@ -52,7 +52,7 @@ impl Scene {
         Scene {
             field: after.then(|| FieldScene::new(spec, &classifier)),
             classifier,
-            shader: spec.transfer.shading.on.then(|| Shader::new(&spec.transfer.shading)),
+            shading: spec.transfer.shading,
             quality: spec.quality,
             grid: BrickGrid::new(spec.volume.lattice.dims),
             dims: spec.volume.lattice.dims,
@@ -103,6 +103,8 @@ pub struct Frame {
     offsets: Box<[[f64; 512]; 3]>,
     /// Unit direction to the eye in world axes, in orthographic views.
     pub(crate) to_eye: Option<Vec3>,
+    /// Light on voxels as this view has it; `None` where voxels are unlit.
+    pub shader: Option<Shader>,
     /// Integer positions, where all sections of all voxels share one footprint.
     #[doc(hidden)]
     pub flat: Option<Flat>,
@@ -227,10 +229,12 @@ impl Frame {
             let v = view.offset_in_eye(local_position(i)).to_array();
             offsets.iter_mut().zip(v).for_each(|(offsets, v)| offsets[usize::from(i)] = v);
         }
+        let shading = &scene.shading;
+        let shader = shading.on.then(|| Shader::new(shading, &view.eye_from_world));
         let field = scene
             .field
             .as_ref()
-            .map(|field| FieldRule::new(field, scene.shader.as_ref(), q, &view, spread).into());
+            .map(|field| FieldRule::new(field, shader.as_ref(), q, &view, spread).into());
         Frame {
             field,
             flat,
@@ -241,6 +245,7 @@ impl Frame {
             raw_scale,
             offsets,
             to_eye,
+            shader,
             view,
             scene,
         }
@@ -347,7 +352,7 @@ impl Frame {
                 colours[c][i] = look.rgb[c];
             }
         }
-        if let Some(shader) = &self.scene.shader {
+        if let Some(shader) = &self.shader {
             let to_eye = self.to_eye.expect("rays are parallel");
             let mut lit = [[0.0; MOST]; 2];
             shader.light_terms_all(normals, |_| to_eye, &mut lit);
@@ -391,7 +396,7 @@ impl Frame {
         let (Some(rule), Some(scene)) = (&self.field, &self.scene.field) else {
             unreachable!("a frame whose sheets hold planes")
         };
-        rule.close_row(simd, (scene, self.scene.shader.as_ref()), row, at, live)
+        rule.close_row(simd, (scene, self.shader.as_ref()), row, at, live)
     }
 
     /// Returns what voxel `i` of `brick`, at eye coordinates `eye` in vox, adds to a sheet per unit
@@ -403,7 +408,7 @@ impl Frame {
     #[inline]
     pub fn payload(&self, brick: &Brick, i: usize, eye: DVec3) -> [f32; 4] {
         let look = self.scene.classifier.classify_voxel(brick, i);
-        let rgb = match &self.scene.shader {
+        let rgb = match &self.shader {
             None => look.rgb,
             Some(shader) => {
                 let normal = brick.normals.as_ref().map_or(NO_NORMAL, |n| n[i]);

@@ -14,7 +14,7 @@ use slabcast_common::image::FrameState;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Quality, Sums};
-use slabcast_common::shade::{Shading, encode_normal};
+use slabcast_common::shade::{Light, Shading, encode_normal};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
@@ -38,7 +38,14 @@ fn vessels() -> TransferFunction {
         opacity_unit: OpacityUnit::AlphaPerVox,
         nan: NanColour::default(),
         gradient_opacity: Vec::new(),
-        shading: Shading::default(),
+        shading: Shading {
+            on: true,
+            ambient: 0.2,
+            diffuse: 0.7,
+            specular: 0.1,
+            power: 20.0,
+            light: Light::Head,
+        },
     }
 }
 

@@ -357,7 +357,7 @@ fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
         (with(&["--view", "left", "--azimuth", "3"]), &["--view", "--azimuth"]),
         (with(&["--crop", "1:2"]), &["--crop", "FROM:TO"]),
         (with(&["--crop", "99:,:,:"]), &["--crop", "outside"]),
-        (with(&["--light", "up"]), &["--light", "head"]),
+        (with(&["--light", "up"]), &["--light", "key", "head", "X,Y,Z"]),
         (with(&["--shading", "maybe"]), &["--shading"]),
         (with(&["--nan", "red"]), &["--nan", "#rrggbb"]),
         (with(&["--colors", "virids"]), &["--colors", "did you mean `viridis`"]),

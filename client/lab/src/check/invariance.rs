@@ -17,7 +17,7 @@ use super::shot::{ReferenceKind, Shot};
 use glam::DVec3;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::quality::Quality;
-use slabcast_common::shade::{HeadWord, Light};
+use slabcast_common::shade::Light;
 use slabcast_common::transfer::{ColorSpace, TransferFunction};
 use slabcast_render::judge::reference::ErrorFigures;
 use slabcast_session::direct::Cut;
@@ -120,7 +120,7 @@ fn axes(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
             stored = stored.max(largest(&want, &case.picture(&shot.stored(*t))?));
         }
         let mut lit = shot.clone();
-        lit.transfer.shading.light = Light::Head(HeadWord::Head);
+        lit.transfer.shading.light = Light::Head;
         let want = case.picture(&lit)?;
         for t in &turns {
             let got = case.picture(&lit.turned(*t))?;

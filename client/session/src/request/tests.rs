@@ -89,6 +89,7 @@ fn refusals_name_the_flag() {
         ("--crop 1:2", "--crop"),
         ("--crop 9:2,:,:", "--crop"),
         ("--light 0,0,0", "--light"),
+        ("--light foo", "give key"),
         ("--nan red", "--nan"),
         ("--colors virids", "did you mean `viridis`"),
         ("--path no.json", "no.json:"),

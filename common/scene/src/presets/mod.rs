@@ -17,7 +17,7 @@ pub use levels::{Content, Levels};
 pub use maps::{MAPS, colour_map};
 
 use slabcast_common::quality::InvalidField;
-use slabcast_common::shade::Shading;
+use slabcast_common::shade::{Light, Shading};
 use slabcast_common::spelling::nearest;
 use slabcast_common::transfer::{
     ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction, interpolate,
@@ -225,13 +225,15 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, I
                 None => l.densest,
             };
             let mut tf = surface(&STEEL, [cut, top], cut * 0.97, cut + (top - cut) * 0.2);
-            let gloss = Shading { diffuse: 0.6, specular: 0.4, power: 40.0, ..Shading::default() };
+            let gloss = Shading { diffuse: 0.7, specular: 0.5, power: 40.0, ..Shading::default() };
             tf.shading = gloss;
             tf
         }
         "plant" => surface(&LEAVES, [air, top], air, solid),
         "glass" => TransferFunction {
             gradient_opacity: vec![[0.02, 0.0], [0.12, 0.25], [0.3, 1.0]],
+            // Many faint borders behind each other: from aside their noise would be all shadows.
+            shading: Shading { light: Light::Head, ..Shading::default() },
             ..look(&GLASS, [air, top], &[[air, 0.0], [solid, 0.08], [top, 0.2]])
         },
         "fog" => fog(&MIST, 0.03),
@@ -425,6 +427,15 @@ fn peer(summary: &ValueSummary, colors: &Colours, opacities: &[[f64; 2]]) -> Tra
     let x = |x: f64| if raw { summary.map.value(x) } else { x / 255.0 };
     let mut tf = look(colors, [0.0, 1.0], &[]);
     tf.domain = if raw { Domain::Value } else { Domain::Unit };
+    // As other renderers light it that are measured beside this one; it never changes.
+    tf.shading = Shading {
+        on: true,
+        ambient: 0.2,
+        diffuse: 0.7,
+        specular: 0.1,
+        power: 20.0,
+        light: Light::Head,
+    };
     tf.colors = colors.iter().map(|c| [x(c[0]), c[1], c[2], c[3]]).collect();
     tf.opacities = opacities.iter().map(|o| [x(o[0]), o[1]]).collect();
     if raw && summary.map.scale < 0.0 {

@@ -113,7 +113,7 @@ pub(super) fn close<S: FieldSum>(
     row.secant[0] = frame.view.secant(x as i32, y as i32);
     row.a[0] = out.a[i];
     let pixels = [[x as i32, y as i32]; LANES];
-    let looks = (scene, frame.scene.shader.as_ref());
+    let looks = (scene, frame.shader.as_ref());
     rule.close_row(Simd::plain(), looks, &mut row, (&pixels, k), 1);
     out.a[i] = row.a[0];
     for (sum, light) in out.colour[i].iter_mut().zip(&row.light) {

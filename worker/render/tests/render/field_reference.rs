@@ -7,7 +7,7 @@ use glam::{DMat3, DVec3};
 use slabcast_common::brick::{Brick, BrickGrid, local_position};
 use slabcast_common::ids::BrickId;
 use slabcast_common::quality::{Classify, Compositing, Kernel, Quality};
-use slabcast_common::shade::{HeadWord, Light, Shading};
+use slabcast_common::shade::{FILL, KEY, Light, Shading};
 use slabcast_common::transfer::{Classifier, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, Projection, View};
 use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
@@ -299,15 +299,21 @@ fn lit(light: Light) -> TransferFunction {
 
 /// The formula of light, written down anew; all in eye axes.
 fn light_on(
-    shading: &Shading,
+    (shading, view): (&Shading, &View),
     range: f64,
     rgb: [f64; 3],
-    [gradient, to_eye, to_light]: [DVec3; 3],
+    [gradient, to_eye]: [DVec3; 2],
 ) -> [f64; 3] {
+    let (to_light, fill) = match shading.light {
+        Light::Key => (DVec3::from_array(KEY), FILL),
+        Light::Head => (to_eye, 0.0),
+        Light::Direction(d) => (view.eye_from_world * DVec3::from_array(d).normalize(), 0.0),
+    };
     let side = if gradient.dot(to_eye) >= 0.0 { 1.0 } else { -1.0 };
     let normal = (side * gradient + range / 1020.0 * to_eye).normalize();
     let half = (to_light + to_eye).normalize();
-    let lambert = shading.ambient + shading.diffuse * normal.dot(to_light).max(0.0);
+    let [of_light, of_eye] = [to_light, to_eye].map(|d| normal.dot(d).max(0.0));
+    let lambert = shading.ambient + shading.diffuse * ((1.0 - fill) * of_light + fill * of_eye);
     let gloss = shading.specular * libm::pow(normal.dot(half).max(0.0), shading.power);
     rgb.map(|c| (c * lambert + gloss).clamp(0.0, 1.0))
 }
@@ -321,10 +327,6 @@ fn by_brute_force(scene: &JudgedScene, reference: &FieldReference, pixel: [u32; 
     let (from, along, _) = ray(&scene.view, pixel);
     let (tf, info) = (&scene.spec.transfer, &scene.spec.volume);
     let looks = Classifier::new(tf, info, Compositing::Linear);
-    let to_light = match tf.shading.light {
-        Light::Head(_) => -along,
-        Light::Direction(d) => scene.view.eye_from_world * DVec3::from_array(d).normalize(),
-    };
     let range = info.summary.max_code - info.summary.min_code;
     let wide = (leave - enter) / f64::from(PLACES);
     let place = |i: u32| {
@@ -344,7 +346,7 @@ fn by_brute_force(scene: &JudgedScene, reference: &FieldReference, pixel: [u32; 
             }
             let rgb = if tf.shading.on {
                 let gradient = last.1 + (next.1 - last.1) * t;
-                light_on(&tf.shading, range, rgb, [gradient, -along, to_light])
+                light_on((&tf.shading, &scene.view), range, rgb, [gradient, -along])
             } else {
                 rgb
             };
@@ -366,7 +368,9 @@ fn pixels_equal_brute_force_unlit_and_lit() {
     for (n, (lattice, projection, tf)) in [
         (unit([12, 14, 11]), ORTHO, several()),
         (unit([12, 14, 11]), persp, several()),
-        (unit([12, 14, 11]), ORTHO, lit(Light::Head(HeadWord::Head))),
+        (unit([12, 14, 11]), ORTHO, lit(Light::Head)),
+        (unit([12, 14, 11]), ORTHO, lit(Light::Key)),
+        (skewed, persp, lit(Light::Key)),
         (unit([12, 14, 11]), inside, lit(Light::Direction([0.4, 0.3, 2.0]))),
         (skewed, persp, lit(Light::Direction([-1.0, 3.0, 2.0]))),
         (skewed, ORTHO, several()),
@@ -389,7 +393,7 @@ fn pixels_equal_brute_force_unlit_and_lit() {
 
 #[test]
 fn tighter_tolerances_change_nothing_to_speak_of() {
-    let head = Light::Head(HeadWord::Head);
+    let head = Light::Head;
     for projection in [ORTHO, CameraProjection::Persp { fov: 40.0, distance: 24.0 }] {
         let quality = after(Kernel::Gaussian);
         let volume = shapes(unit([16; 3]));
@@ -414,7 +418,7 @@ fn lights_on_a_ramp_give_the_formulas_colour() {
     let slope = DVec3::new(3.0, 4.0, -2.0);
     let volume = floats(unit([12, 14, 12]), |p| 60.0 + slope.dot(p));
     let directions = [[0.3, 1.0, -0.7], [1.0, -2.0, 0.5]].map(Light::Direction);
-    for light in [Light::Head(HeadWord::Head), directions[0], directions[1]] {
+    for light in [Light::Key, Light::Head, directions[0], directions[1]] {
         for projection in [ORTHO, CameraProjection::Persp { fov: 20.0, distance: 50.0 }] {
             let shading =
                 Shading { on: true, light, specular: 0.4, power: 7.5, ..Shading::default() };
@@ -429,15 +433,9 @@ fn lights_on_a_ramp_give_the_formulas_colour() {
             for at in [[16, 16], [14, 17], [18, 13]] {
                 let (_, along, _) = ray(&scene.view, at);
                 let gradient = scene.view.eye_from_index.inverse().transpose() * slope;
-                let to_light = match light {
-                    Light::Head(_) => -along,
-                    Light::Direction(d) => {
-                        scene.view.eye_from_world * DVec3::from_array(d).normalize()
-                    }
-                };
                 let range = summary.max_code - summary.min_code;
-                let axes = [gradient, -along, to_light];
-                let colour = light_on(&shading, range, [0.6, 0.4, 0.1], axes);
+                let of = (&shading, &scene.view);
+                let colour = light_on(of, range, [0.6, 0.4, 0.1], [gradient, -along]);
                 let a = -libm::expm1(-1.5 * 4.0 / gradient.dot(along).abs());
                 let want = [colour[0] * a, colour[1] * a, colour[2] * a, a];
                 let got = reference.pixel(at[0], at[1]);

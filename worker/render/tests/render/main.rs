@@ -19,6 +19,7 @@ mod field_reference;
 mod footprint;
 mod general;
 mod kernels;
+mod light;
 mod lut;
 mod on_paper;
 mod open_mask;

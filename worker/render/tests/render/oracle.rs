@@ -13,7 +13,7 @@ use slabcast_common::image::{FrameState, Picture};
 use slabcast_common::message::{Counters, SceneSpec};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Classify, Compositing, Kernel, Quality, Sums};
-use slabcast_common::shade::Shading;
+use slabcast_common::shade::{Light, Shading};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
@@ -245,6 +245,8 @@ proptest! {
         let view = View::new(&v.lattice, &camera, size, &quality).unwrap();
         let bricks = bricks_of(&v);
         let mut look = lit(top, unit);
+        let lights = [Light::Key, Light::Head, Light::Direction([1.0, -0.4, 0.7])];
+        look.shading.light = lights[(seed >> 1) as usize % 3];
         if after && seed & 12 == 0 {
             look.gradient_opacity = vec![[0.0, 0.1], [0.05, 0.7], [0.2, 1.0]];
         }

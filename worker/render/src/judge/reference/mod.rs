@@ -135,13 +135,14 @@ impl Reference {
         bricks.sort_by_key(|(brick, _)| brick.id);
         let kernel = spec.quality.kernel;
         let classifier = |c| Classifier::new(&spec.transfer, &spec.volume, c);
+        let shading = &spec.transfer.shading;
         Reference {
             view,
             grid,
             looks: classifier(Compositing::Linear),
             sheet_looks: classifier(spec.quality.compositing),
             compositing: spec.quality.compositing,
-            shader: spec.transfer.shading.on.then(|| Shader::new(&spec.transfer.shading)),
+            shader: shading.on.then(|| Shader::new(shading, &view.eye_from_world)),
             kernel: spread.map(|spread| Profile::new(kernel, std * spread, radius * spread)),
             std: DVec3::from_array(spread) * std,
             lean,

@@ -19,11 +19,11 @@ use super::{LANES, Row, fixed_light};
 #[cfg(target_arch = "x86_64")]
 use crate::kernels::Level;
 use crate::kernels::Simd;
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DVec3, Vec3};
 use slabcast_common::kernel::Profile;
 use slabcast_common::math::{ROUND_F32, opacity};
 use slabcast_common::quality::{Quality, Sums};
-use slabcast_common::shade::Shader;
+use slabcast_common::shade::{Lamp, Shader};
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::SampleKind;
 use std::sync::OnceLock;
@@ -163,8 +163,8 @@ pub struct FieldRule {
     waves: Vec<Wave>,
     projection: Projection,
     size: [f32; 2],
-    /// Unit direction to the light in eye axes; `None` for a head light.
-    light: Option<[f32; 3]>,
+    /// The light in eye axes; `None` for a head light.
+    lamp: Option<Lamp>,
     eps: f32,
 }
 
@@ -259,9 +259,9 @@ impl FieldRule {
                 reach: 0.0,
             }
         });
-        let light = shader.and_then(Shader::light_direction).map(|d| {
+        let lamp = shader.and_then(Shader::lamp).map(|Lamp { to_light: d, fill }| {
             let d = view.eye_from_world * DVec3::new(d.x.into(), d.y.into(), d.z.into());
-            d.to_array().map(|x| x as f32)
+            Lamp { to_light: Vec3::new(d.x as f32, d.y as f32, d.z as f32), fill }
         });
         let payload = if short { spread.x * spread.y * spread.z } else { 1.0 };
         FieldRule {
@@ -283,7 +283,7 @@ impl FieldRule {
             waves: Wave::all(&profile, &own_from_index, view),
             projection: view.projection,
             size: view.size.map(|n| n as f32),
-            light,
+            lamp,
             eps: quality.eps as f32,
         }
     }
@@ -599,12 +599,14 @@ impl FieldRule {
         let z = gz * side + self.flat * ez;
         let per_length = 1.0 / (x * x + y * y + z * z).sqrt();
         let (nx, ny, nz) = (x * per_length, y * per_length, z * per_length);
-        let [mut lambert, mut gloss] = [[nx * ex + ny * ey + nz * ez]; 2];
-        if let Some([lx, ly, lz]) = self.light {
+        let n_eye = nx * ex + ny * ey + nz * ez;
+        let [mut lambert, mut gloss] = [[n_eye]; 2];
+        if let Some(lamp) = self.lamp {
+            let [lx, ly, lz] = lamp.to_light.to_array();
             let (hx, hy, hz) = (lx + ex, ly + ey, lz + ez);
             let square = hx * hx + hy * hy + hz * hz;
             let per_half = if square > 1e-12 { 1.0 / square.sqrt() } else { 0.0 };
-            lambert = [nx * lx + ny * ly + nz * lz];
+            lambert = [lamp.lambert(nx * lx + ny * ly + nz * lz, n_eye)];
             gloss = [(nx * hx + ny * hy + nz * hz) * per_half];
         }
         shader.terms(&mut lambert, &mut gloss, 1);

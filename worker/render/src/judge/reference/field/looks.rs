@@ -6,7 +6,7 @@
 use glam::DVec3;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::Compositing;
-use slabcast_common::shade::{Light, Shading};
+use slabcast_common::shade::{FILL, KEY, Light, Shading};
 use slabcast_common::transfer::{Classifier, Domain};
 use slabcast_common::view::View;
 
@@ -152,6 +152,8 @@ pub(super) struct Lamp {
     power: f64,
     /// Unit direction to the light in eye axes; `None` where the eye holds it.
     to_light: Option<DVec3>,
+    /// Share of diffuse light from the eye.
+    fill: f64,
     /// How much of the direction to the eye is added to a gradient, in codes per vox.
     to_face: f64,
 }
@@ -160,11 +162,12 @@ impl Lamp {
     /// `None` if the scene is unlit. `range` is the difference of the largest and the smallest
     /// code.
     pub(super) fn new(shading: &Shading, view: &View, range: f64) -> Option<Lamp> {
-        let to_light = match shading.light {
-            Light::Head(_) => None,
+        let (to_light, fill) = match shading.light {
+            Light::Key => (Some(DVec3::from_array(KEY)), FILL),
+            Light::Head => (None, 0.0),
             Light::Direction(d) => {
                 let d = DVec3::from_array(d);
-                Some(view.eye_from_world * (d / d.length()))
+                (Some(view.eye_from_world * (d / d.length())), 0.0)
             }
         };
         shading.on.then_some(Lamp {
@@ -173,6 +176,7 @@ impl Lamp {
             specular: shading.specular,
             power: shading.power,
             to_light,
+            fill,
             to_face: range / 1020.0,
         })
     }
@@ -187,7 +191,8 @@ impl Lamp {
             // Right behind there is no gloss.
             Some(light) => unit(light + to_eye, DVec3::ZERO),
         };
-        let lambert = self.ambient + self.diffuse * normal.dot(to_light).max(0.0);
+        let [key, fill] = [to_light, to_eye].map(|d| normal.dot(d).max(0.0));
+        let lambert = self.ambient + self.diffuse * (key + (fill - key) * self.fill);
         let gloss = self.specular * libm::pow(normal.dot(half).max(0.0), self.power);
         rgb.map(|c| (c * lambert + gloss).clamp(0.0, 1.0))
     }

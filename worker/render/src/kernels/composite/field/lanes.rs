@@ -364,10 +364,11 @@ unsafe fn terms<L: Floats>(
         for n in &mut n {
             *n = L::mul(*n, per_length);
         }
-        let mut lambert = dot::<L>(n, to_eye);
-        let mut gloss = lambert;
-        if let Some([lx, ly, lz]) = rule.light {
-            let light = [L::all(lx), L::all(ly), L::all(lz)];
+        let n_eye = dot::<L>(n, to_eye);
+        let (mut lambert, mut gloss) = (n_eye, n_eye);
+        if let Some(lamp) = rule.lamp {
+            let light = lamp.to_light;
+            let light = [L::all(light.x), L::all(light.y), L::all(light.z)];
             let mut half = light;
             for axis in 0..3 {
                 half[axis] = L::add(half[axis], to_eye[axis]);
@@ -376,7 +377,11 @@ unsafe fn terms<L: Floats>(
             let some = L::below(L::all(1e-12), square);
             let root = L::sqrt(L::select(some, square, L::all(1.0)));
             let per_half = L::only(some, div_into_one::<L>(root));
-            lambert = dot::<L>(n, light);
+            // `Lamp::lambert`.
+            let n_light = L::most(dot::<L>(n, light), L::all(0.0));
+            let n_eye = L::most(n_eye, L::all(0.0));
+            let key = L::mul(L::all(1.0 - lamp.fill), n_light);
+            lambert = L::add(key, L::mul(L::all(lamp.fill), n_eye));
             gloss = L::mul(dot::<L>(n, half), per_half);
         }
         let mut out = [[0.0f32; LANES]; 2];

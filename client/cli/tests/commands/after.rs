@@ -21,7 +21,7 @@ fn reconstructed_pictures_are_the_same_bytes_for_any_workers_and_schedule() {
     let many = sharp("many.png", &["--workers", "3", "--tile", "16"]);
     let slabs = sharp("slabs.png", &["--schedule", "slab", "--slabs", "5", "--workers", "2"]);
     assert_eq!((&many, &slabs), (&one, &one));
-    assert_ne!(one, draw("before.png", &[]), "it is another picture");
+    assert_ne!(one, draw("before.png", &["--classify", "before"]), "it is another picture");
 }
 
 #[test]
@@ -43,19 +43,41 @@ fn reconstructed_pictures_are_within_one_255th_of_their_limit() {
 fn what_reconstruction_does_not_take_is_refused_by_name() {
     let dir = tempfile::tempdir().unwrap();
     let render = ["render", "formula:spheres:24", "--azimuth", "0", "--classify", "after"];
-    let cases: [(&[&str], &str); 4] = [
+    let cases: [(&[&str], &str); 3] = [
         (&["--thickness", "2"], "--thickness: 2 is too thick"),
         (&["--compositing", "paper"], "--compositing: is a rule for voxels"),
         (&["--sums", "f32"], "--sums: `--classify after` adds whole numbers"),
-        (&["--show", "depth"], "--classify: --show depth shows voxels"),
     ];
     for (more, said) in cases {
         let out = run(dir.path(), &[&render[..], more].concat());
         assert_eq!(out.status.code(), Some(2), "{more:?}");
         assert!(text(&out.stderr).contains(said), "{more:?}: {}", text(&out.stderr));
     }
-    let explain = ["lab", "explain", "formula:spheres:24", "--pixel", "9,9", "--classify", "after"];
-    let out = run(dir.path(), &explain);
-    assert_eq!(out.status.code(), Some(2));
-    assert!(text(&out.stderr).contains("--classify: explain shows"), "{}", text(&out.stderr));
+}
+
+#[test]
+fn pixels_of_a_field_are_explained_plane_by_plane() {
+    let dir = tempfile::tempdir().unwrap();
+    let scene = ["formula:spheres:24", "--size", "48x48", "--azimuth", "30"];
+    let explain =
+        |more: &[&str]| good(dir.path(), &[&["lab", "explain"], &scene[..], more].concat());
+    let json: serde_json::Value =
+        serde_json::from_str(&explain(&["--pixel", "24,24", "--json"])).unwrap();
+    let planes = json["planes"].as_array().unwrap();
+    assert!(planes.len() > 2, "{json}");
+    for plane in planes {
+        assert!(plane["voxels"].as_array().unwrap().len() <= 3, "{plane}");
+    }
+    let last = planes.last().unwrap()["t"].as_f64().unwrap();
+    assert!((1.0 - last - json["rgba"][3].as_f64().unwrap()).abs() < 1e-6, "{json}");
+    assert!(json["error"]["limit"].as_f64().unwrap() < 5.0, "{json}");
+    let said = explain(&["--pixel", "24,24"]);
+    for part in ["pixel 24,24 of 48x48", "gradient", "of brick", "limit  "] {
+        assert!(said.contains(part), "{part}: {said}");
+    }
+    assert!(explain(&["--pixel", "0,0"]).contains("no voxel reaches this pixel"));
+    for show in ["depth", "work", "sheets"] {
+        let draw = [&["render"], &scene[..], &["--show", show, "-o", show]].concat();
+        good(dir.path(), &draw);
+    }
 }

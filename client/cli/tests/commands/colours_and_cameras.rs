@@ -114,7 +114,7 @@ fn crop_removes_voxels_outside_the_box() {
 fn gradient_opacity_has_small_error_and_same_bytes_on_clusters() {
     let dir = tempfile::tempdir().unwrap();
     let glass = example("glass.json");
-    let look = ["--tf", &glass, "--azimuth", "30", "--size", "64x48"];
+    let look = ["--tf", &glass, "--azimuth", "30", "--size", "64x48", "--classify", "before"];
     let cluster = [&look[..], &["--workers", "2", "--tile", "16", "--slabs", "5"]].concat();
     let drawn = draw(dir.path(), &cluster).remove(0);
     let out =

@@ -9,11 +9,12 @@ fn convergence_prints_orders_and_writes_figures() {
     let look = r#"{"version":1,"domain":"unit","color_space":"linear","opacity_unit":"extinction",
         "colors":[[0,0,0.2,1],[1,1,0.8,0]],"opacities":[[0,0],[1,0.5]],"shading":{"on":false}}"#;
     std::fs::write(&tf, look).expect("a file");
-    let run = |more: &[&str]| {
+    let run = |order: &str, more: &[&str]| {
         let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
             .args(["lab", "check", "convergence", "formula:ramp:12", "--size", "48x48", "--tf"])
             .arg(&tf)
             .args(["--azimuth", "25", "--elevation", "20", "--pixels", "128", "--thinnest", "4"])
+            .args(["--classify", order])
             .args(more)
             .output()
             .expect("slabcast runs");
@@ -21,7 +22,7 @@ fn convergence_prints_orders_and_writes_figures() {
         String::from_utf8(out.stdout).expect("text")
     };
     let plots = dir.path().join("plots");
-    let lines = run(&["--json", "--plot", plots.to_str().expect("a name")]);
+    let lines = run("before", &["--json", "--plot", plots.to_str().expect("a name")]);
     let sweeps: Vec<serde_json::Value> =
         lines.lines().map(|l| serde_json::from_str(l).expect("JSON")).collect();
     assert_eq!(sweeps.len(), 2, "both projections");
@@ -47,8 +48,19 @@ fn convergence_prints_orders_and_writes_figures() {
     let svg = std::fs::read_to_string(plots.join("ramp-12.svg")).expect("a figure");
     assert!(svg.starts_with("<svg") && svg.contains("perspective") && svg.len() < 60 << 10);
 
-    let text = run(&["--placement"]);
+    let text = run("before", &["--placement"]);
     for word in ["ortho", "persp", "order", "along the ray", "the paper's form goes to a limit"] {
         assert!(text.contains(word), "{word}: {text}");
     }
+
+    // Both orders of classification have a sweep; fields begin at one vox.
+    let lines = run("after", &["--json"]);
+    for line in lines.lines() {
+        let sweep: serde_json::Value = serde_json::from_str(line).expect("JSON");
+        let rmse = |i: usize| sweep["figures"][i]["rmse"].as_f64().expect("a figure");
+        assert_eq!(sweep["figures"].as_array().expect("figures").len(), 3, "1, 1/2 and 1/4 vox");
+        assert!(rmse(2) < rmse(0) && rmse(2) < 0.3, "{line}");
+    }
+    assert_eq!(lines.lines().count(), 2, "both projections");
+    assert!(run("after", &[]).contains("i16"));
 }

@@ -1,10 +1,12 @@
-//! `slabcast lab error` as a user runs it: figures that make sense of each other.
+//! `slabcast lab error --classify before` as a user runs it: figures that make sense of each other.
+//! The other order has its test in `after.rs`.
 
 use std::process::Command;
 
 fn error(arguments: &[&str]) -> serde_json::Value {
     let mut command = Command::new(env!("CARGO_BIN_EXE_slabcast"));
-    command.args(["lab", "error", "formula:spheres:32", "--json"]).args(arguments);
+    command.args(["lab", "error", "formula:spheres:32", "--json", "--classify", "before"]);
+    command.args(arguments);
     for (flag, value) in [("--size", "96x80"), ("--pixels", "1500")] {
         if !arguments.contains(&flag) {
             command.args([flag, value]);

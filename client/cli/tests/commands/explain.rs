@@ -14,7 +14,7 @@ fn run(arguments: &[&str]) -> Output {
 fn explain_pixel_as_json_lists_sheets_that_composite_to_it() {
     for arguments in [&["--projection", "persp"][..], &["--thickness", "0.5", "--eps", "0"]] {
         let mut line = vec!["formula:spheres:32", "--size", "64x64", "--pixel", "30,32"];
-        line.extend(["--json", "--voxels", "2"].iter().chain(arguments));
+        line.extend(["--classify", "before", "--json", "--voxels", "2"].iter().chain(arguments));
         let out = run(&line);
         assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
         let e: serde_json::Value = serde_json::from_slice(&out.stdout).expect("JSON");
@@ -40,12 +40,13 @@ fn explain_pixel_as_json_lists_sheets_that_composite_to_it() {
 
 #[test]
 fn explain_pixel_as_text_says_where_it_was_shut_and_its_limit() {
-    let out = run(&["formula:spheres:32", "--size", "64x64", "--pixel", "32,32"]);
+    let scene = ["formula:spheres:32", "--size", "64x64", "--classify", "before"];
+    let out = run(&[&scene[..], &["--pixel", "32,32"]].concat());
     let text = String::from_utf8_lossy(&out.stdout);
     for part in ["pixel 32,32 of 64x64", "shut in sheet", "of brick", "T in f64", "limit  "] {
         assert!(text.contains(part), "{part}: {text}");
     }
-    let out = run(&["formula:spheres:32", "--size", "64x64", "--pixel", "0,0"]);
+    let out = run(&[&scene[..], &["--pixel", "0,0"]].concat());
     assert!(out.status.success());
     assert!(String::from_utf8_lossy(&out.stdout).contains("no voxel reaches this pixel"));
 }
@@ -104,10 +105,18 @@ fn ablation_of_unneeded_brick_content_changes_no_pixel() {
 fn keep_flag_is_not_reported_as_left_out() {
     let dir = tempfile::tempdir().unwrap();
     let frame = |keep: &[&str]| -> serde_json::Value {
-        // In 16-bit sums, which `auto` would take, grey is no less than three colours.
-        let line =
-            ["render", "formula:spheres:40", "--tf", "grey", "--sums", "i32", "--azimuth", "30"];
-        let rest = ["--size", "80x80", "--stats", "s.jsonl", "--force", "-o", "a.png"];
+        let line = ["render", "formula:spheres:40", "--tf", "grey", "--azimuth", "30"];
+        let rest = [
+            "--classify",
+            "before",
+            "--size",
+            "80x80",
+            "--stats",
+            "s.jsonl",
+            "--force",
+            "-o",
+            "a.png",
+        ];
         let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
             .args(line)
             .args(rest)
@@ -123,10 +132,10 @@ fn keep_flag_is_not_reported_as_left_out() {
         let list = frame["left_out"].as_array().unwrap();
         list.iter().map(|l| l["name"].as_str().unwrap().to_string()).collect()
     };
-    let (lean, full) = (frame(&[]), frame(&["--keep", "empty,normals,gradients,colours"]));
+    let (lean, full) = (frame(&[]), frame(&["--keep", "empty,normals,gradients"]));
     assert_eq!(lean["pixels_sha256"], full["pixels_sha256"]);
     let (lean, full) = (names(&lean), names(&full));
-    for name in ["empty", "normals", "gradients", "colour"] {
+    for name in ["empty", "normals", "gradients"] {
         assert!(
             lean.iter().any(|n| n == name) && !full.iter().any(|n| n == name),
             "{lean:?} {full:?}"

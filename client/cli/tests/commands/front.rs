@@ -23,7 +23,8 @@ fn report_writes_all_files_and_marks_front_and_default() {
     let dir = tempfile::tempdir().unwrap();
     let only =
         ["--only", "thickness,eps,sums,shading,work", "--pixels", "900", "--seconds", "0.01"];
-    let out = run(dir.path(), &[&["lab", "report"], &SCENE, &only, &["-o", "r"]]);
+    let order = ["--classify", "before", "-o", "r"];
+    let out = run(dir.path(), &[&["lab", "report"], &SCENE, &only, &order]);
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     let said = String::from_utf8_lossy(&out.stdout).into_owned();
     assert!(said.contains("all the same picture, to the bit"), "{said}");
@@ -196,7 +197,7 @@ fn statistics_contain_error_estimates_by_source() {
         // The bound of 16-bit sums, which `auto` takes for fog, says nothing.
         let scene = [&scene[..], &["--sums", "i32"]].concat();
         // A frame of a turn and the same azimuth alone have another framing each.
-        let scene = [&scene[..], &["--fit", "volume"]].concat();
+        let scene = [&scene[..], &["--fit", "volume", "--classify", "before"]].concat();
         let draw = |out: &str, more: &[&str]| {
             let how = ["--start", "33", "--step", "77", "--frames", "2", "-o", out];
             let done = run(dir, &[&["render"], &scene, &how, more]);

@@ -17,7 +17,7 @@ fn thin(volume: &str, look: &[&str]) {
     for view in views {
         let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
             .args(["lab", "error", volume, "--height", "15", "--size", "24x24", "--azimuth", "20"])
-            .args(["--thickness", "0.0625", "--sums", "i32", "--eps", "0"])
+            .args(["--classify", "before", "--thickness", "0.0625", "--sums", "i32", "--eps", "0"])
             .args(["--pixels", "48", "--model-pixels", "1", "--json"])
             .args(view)
             .args(look)

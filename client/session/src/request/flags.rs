@@ -190,12 +190,12 @@ pub struct QualityArgs {
     #[arg(long, value_name = "STEPS", default_value = "2.0", value_parser = parse::number,
           allow_negative_numbers = true, hide_short_help = true)]
     radius: f64,
-    /// Classify values after or before the kernel reconstructs them
+    /// Classify values after or before the kernel reconstructs them [default: after]
     ///
     /// `after` gives sharp surfaces; `before` blurs classified voxels, as in the paper.
-    #[arg(long, default_value = "after", value_name = "ORDER", hide_short_help = true,
+    #[arg(long, value_name = "ORDER", hide_short_help = true,
           value_parser = words(&[("after", Classify::After), ("before", Classify::Before)]))]
-    classify: Classify,
+    classify: Option<Classify>,
     /// How sheets are composited
     ///
     /// `paper` is the paper's additive opacity.
@@ -225,15 +225,17 @@ pub struct QualityArgs {
 }
 
 impl QualityArgs {
-    fn quality(&self) -> Result<Quality, Fail> {
-        let default = Quality::of(self.classify);
+    /// `usual` is the order of classification where no flag says which.
+    fn quality(&self, usual: Classify) -> Result<Quality, Fail> {
+        let classify = self.classify.unwrap_or(usual);
+        let default = Quality::of(classify);
         let q = Quality {
             thickness: self.thickness.unwrap_or(default.thickness),
             eps: self.eps,
             kernel: self.kernel.unwrap_or(default.kernel),
             std: self.std,
             radius: self.radius,
-            classify: self.classify,
+            classify,
             compositing: self.compositing,
             splat: self.splat,
             sums: self.sums,
@@ -262,9 +264,27 @@ impl SceneArgs {
     /// # Errors
     /// A flag or file is wrong in itself, or a quality target is given.
     pub fn request(&self, work: Work) -> Result<RenderRequest, Fail> {
+        self.request_in(Classify::After, work)
+    }
+
+    /// Returns the request of a command about the paper's order, classification before
+    /// reconstruction.
+    ///
+    /// # Errors
+    /// A flag or file is wrong in itself, or asks for the other order or a quality target.
+    pub fn request_before(&self, work: Work) -> Result<RenderRequest, Fail> {
+        if self.quality.classify == Some(Classify::After) {
+            return Err(Fail::usage(
+                "--classify: this command is about `before`, the paper's order; leave it out",
+            ));
+        }
+        self.request_in(Classify::Before, work)
+    }
+
+    fn request_in(&self, usual: Classify, work: Work) -> Result<RenderRequest, Fail> {
         let target = &self.quality.target;
         if target.is_empty() {
-            return self.request_with_target(work);
+            return self.any_request(usual, work);
         }
         Err(Fail::usage(format!(
             "{}: this command compares qualities that are given; leave it out (render, lab bench \
@@ -279,8 +299,12 @@ impl SceneArgs {
     /// # Errors
     /// A flag or file is wrong in itself.
     pub fn request_with_target(&self, work: Work) -> Result<RenderRequest, Fail> {
+        self.any_request(Classify::After, work)
+    }
+
+    fn any_request(&self, usual: Classify, work: Work) -> Result<RenderRequest, Fail> {
         let SceneArgs { view, picture, quality: flags } = self;
-        let quality = flags.quality()?;
+        let quality = flags.quality(usual)?;
         view.axes.orientation()?;
         let mut path = match &view.path {
             Some(file) => view.path_from_file(file, picture)?,

@@ -100,12 +100,15 @@ impl BrickNeeds {
     }
 
     /// Returns whether bricks made for these needs serve a job with needs `other`. The box must be
-    /// the same: voxels outside of a smaller one would be drawn.
+    /// the same: voxels outside of a smaller one would be drawn. With a halo the voxels must be the
+    /// same, too: those beyond it have weights that change the last bits of a field.
     pub fn covers(&self, other: &BrickNeeds) -> bool {
+        if self.halo > 0 || other.halo > 0 {
+            return self == other;
+        }
         self.support.covers(&other.support)
             && (self.normals || !other.normals)
             && (self.gradients || !other.gradients)
-            && self.halo >= other.halo
             && self.crop == other.crop
     }
 

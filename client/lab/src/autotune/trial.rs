@@ -364,7 +364,8 @@ mod tests {
         let volume = slabcast_session::volume::open("formula:spheres:32".as_ref()).unwrap();
         let path =
             ViewPath::from_turntable([64, 64], Turntable { frames: 3, ..Turntable::default() });
-        let request = RenderRequest::for_preset(path, tf).unwrap();
+        let mut request = RenderRequest::for_preset(path, tf).unwrap();
+        request.quality = Quality::before();
         let info = volume.info(volume.digest());
         Trial::new(volume, info, &request, Orientation::new(None, None).unwrap(), 2).unwrap()
     }

@@ -40,7 +40,7 @@ fn defaults_are_those_of_the_contract() {
     ] {
         assert_eq!(asked(line).unwrap().path.fit, fit, "{line}");
     }
-    assert_eq!((a.quality, a.work), (Quality::before(), Work::default()));
+    assert_eq!((a.quality, a.work), (Quality::default(), Work::default()));
     let message = a.to_message(&cube(), PixelFormat::Rgb8, false);
     assert_eq!(message.transfer, TransferChoice::Name("auto".into()));
     assert_eq!(message.background, Background::Colour([0.0; 3]));
@@ -51,7 +51,7 @@ fn flags_mean_what_they_say() {
     let a = asked(
         "--azimuth -30 --elevation=-10 --height 5 --projection persp --fov 40 --up=-y \
          --front -x --tf bone --size 64x32 --background transparent --thickness 0.5 --eps 1/256 \
-         --std 0.5 --radius 2.5 --compositing paper --sums f32 --cull off --slabs 5 \
+         --classify before --std 0.5 --radius 2.5 --compositing paper --sums f32 --cull off --slabs 5 \
          --tiles-per-thread 3 --tile 64 --schedule slab",
     )
     .unwrap();
@@ -60,6 +60,9 @@ fn flags_mean_what_they_say() {
     assert_eq!((t.projection, t.fov), (ProjectionKind::Persp, 40.0));
     assert_eq!((t.up, t.front), ("-y".parse().ok(), "-x".parse().ok()));
     assert_eq!((a.quality.eps, a.quality.cull), (1.0 / 256.0, false));
+    let before = asked("--classify before").unwrap().quality;
+    assert_eq!(before, Quality::before());
+    assert_eq!(asked("--thickness 2/3 --kernel bspline").unwrap().quality, Quality::default());
     assert_eq!((a.work.slabs, a.work.tile), (5, Some(64)));
     assert_eq!(a.background, Background::Transparent);
 }

@@ -70,16 +70,18 @@ fn check_all(volume: &Volume, needs: &BrickNeeds) -> BrickStore {
                 let found = seen.remove(&[k, j, i]);
                 let halo = needs.halo;
                 let near = |n: u32, at: u32| at.saturating_sub(halo)..=(at + halo).min(n - 1);
+                // A kernel also takes in voxels beside the box.
+                let beside = if halo > 0 { 1.0 } else { 0.0 };
+                let crop = needs.crop.map(|c| c.grown(&volume.lattice, beside));
                 let visible = |at: [u32; 3]| {
                     let offset = (at[2] * dims[1] + at[1]) * dims[0] + at[0];
                     support.contains(volume.samples.code(offset as usize))
-                        && needs.crop.is_none_or(|c| c.contains(&volume.lattice, at))
+                        && crop.is_none_or(|c| c.contains(&volume.lattice, at))
                 };
                 let wanted = near(dims[2], k).any(|z| {
                     near(dims[1], j).any(|y| near(dims[0], i).any(|x| visible([x, y, z])))
                 });
-                let inside = needs.crop.is_none_or(|c| c.contains(&volume.lattice, [i, j, k]));
-                if !wanted || !inside {
+                if !wanted {
                     assert!(found.is_none(), "({i}, {j}, {k}) is not relevant");
                     continue;
                 }

@@ -122,6 +122,6 @@ fn cropped_and_modulated_pictures_approach_the_limit() {
             assert!(covered > 500, "{covered} pixels show something");
             errors.push(255.0 * (sum / covered as f64 / 4.0).sqrt());
         }
-        assert!(errors[1] < 0.5 && errors[1] < 0.6 * errors[0], "{projection:?}: {errors:?} /255");
+        assert!(errors[1] < 0.7 && errors[1] < 0.7 * errors[0], "{projection:?}: {errors:?} /255");
     }
 }

@@ -3,7 +3,7 @@
 //!
 //! A voxel adds `((payload * w_z) * w_y) * w_x` with four weights each, one for each channel
 //! ([`crate::primitives::field_taps`]). Loops are written plainly; pixel records have
-//! registers of x86 as well ([`lanes`]), which must equal them.
+//! registers of x86 as well (`lanes`), which must equal them.
 
 #[cfg(target_arch = "x86_64")]
 mod lanes;

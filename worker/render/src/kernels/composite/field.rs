@@ -6,7 +6,7 @@
 //! the value were linear in it (pre-integration: K. Engel et al., 2001), light falls on its middle.
 //! docs/design/sharp.md has the alternatives and what each costs.
 //!
-//! [`FieldRule::close_pixel`] is the plain version. [`lanes`] does the same operations in the same
+//! `FieldRule::close_pixel` is the plain version. `lanes` does the same operations in the same
 //! order on registers of x86, so that both give the same bytes.
 
 #[cfg(target_arch = "x86_64")]

@@ -43,7 +43,7 @@ pub fn decode_normal(code: u16) -> Vec3 {
     Vec3::new(x * scale, y * scale, z * scale)
 }
 
-/// Where light comes from.
+/// Source of light: a key light with fill, the eye, or a direction.
 ///
 /// With the normal n turned towards the eye, e the direction to the eye, l that to the light and h
 /// half-way between both, all of unit length, a base colour c becomes
@@ -132,7 +132,7 @@ pub struct Shading {
     pub specular: f64,
     /// Exponent of the specular light, 0 to 10000; unitless.
     pub power: f64,
-    /// Where the light is: fixed to the camera, or in the world.
+    /// Light source: fixed to the camera, or a direction in the world.
     pub light: Light,
 }
 

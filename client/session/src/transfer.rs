@@ -25,7 +25,7 @@ pub struct TransferFlags {
     /// spread over the values that the transfer function shows.
     #[arg(long, value_name = "MAP|FILE")]
     colors: Option<String>,
-    /// Where light comes from: key (up left of the eye), head (the eye), or a direction in world axes
+    /// Light source: key (up left of the eye), head (the eye), or a direction in world axes
     #[arg(long, value_name = "key|head|X,Y,Z", value_parser = parse::light, allow_hyphen_values = true,
           hide_short_help = true)]
     light: Option<Light>,

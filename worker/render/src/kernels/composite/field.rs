@@ -157,7 +157,7 @@ pub struct FieldRule {
     /// Weights near the faces of each axis, made when a pixel first needs them.
     weights: OnceLock<[Box<[[f32; 2]]>; 3]>,
     profile: Profile,
-    /// For each index axis: what a step along the kernel's three axes is along it, in lattice steps.
+    /// Components along each index axis of unit steps along the kernel's three axes, in lattice steps.
     across: [[f64; 3]; 3],
     /// Waves of the sum of weights.
     waves: Vec<Wave>,
@@ -334,7 +334,7 @@ impl FieldRule {
         ray
     }
 
-    /// A plane's raw sums as the field. The value is counted from the background.
+    /// Converts raw sums to value (cells above the background) and gradient (cells per vox).
     #[inline(always)]
     fn plane(&self, [value, x, y, z]: [f32; 4]) -> Plane {
         let mut plane = Plane { value: value * self.cell[1], gradient: [0.0; 3] };
@@ -503,7 +503,7 @@ impl FieldRule {
         f64::from(raw * self.cell[1]) / scene.cells_per_code()
     }
 
-    /// Does for lane `i` of a row what [`FieldRule::close_row`] does for all.
+    /// Composites the segment in front of plane `k` at lane `i` of a row ([`FieldRule::close_row`]).
     fn close_pixel(
         &self,
         (scene, shader): (&FieldScene, Option<&Shader>),
@@ -624,8 +624,8 @@ fn beside_face(table: &[[f32; 2]], distance: f32) -> [f32; 2] {
 }
 
 /// Weights of a kernel inside the volume by the distance from a face, in steps of 1 / [`FACE_STEPS`]
-/// from the face on, and their slopes per lattice step. `across` is what a step along each of the
-/// kernel's axes is along the face's normal.
+/// from the face on, and their slopes per lattice step. `across` holds the components along the
+/// face's normal of unit steps along the kernel's axes, in lattice steps.
 ///
 /// Across a face the kernel has the profile that its three profiles, scaled by `across`, make when
 /// they are convolved. The weight is that profile's sum over the planes of samples inside, as a

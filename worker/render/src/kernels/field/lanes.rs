@@ -19,7 +19,7 @@ trait Terms {
 
     unsafe fn zero() -> Self::Register;
     unsafe fn load(from: *const Self::Term) -> Self::Register;
-    /// Four terms, again and again.
+    /// Loads four terms and repeats them across the register.
     unsafe fn four(from: *const Self::Term) -> Self::Register;
     unsafe fn times(a: Self::Register, b: Self::Register) -> Self::Register;
     /// Adds terms to as many sums.

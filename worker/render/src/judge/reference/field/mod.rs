@@ -32,8 +32,9 @@
 //! Voxels that are NaN are left out of both sums, and so are those that no brick holds. Infinities
 //! count as the nearest finite code. Where no kernel reaches there is nothing.
 //!
-//! Where gradients modulate the opacity, extinction is multiplied by their factor. Halving finds the
-//! points of `gradient_opacity`; a jump between two at one magnitude may be missed on a panel.
+//! *Opacity by gradient.* Extinction is multiplied by the factor of `gradient_opacity` at the gradient's
+//! magnitude. Halving a panel finds the points of that function; it may miss a jump between two points
+//! at one magnitude.
 //!
 //! All voxels are kept in one array of 4 bytes each (codes are of 8 or 16 bits or f32, so
 //! f32 has them exactly), 64 MiB for 256^3: too much for the largest volumes.

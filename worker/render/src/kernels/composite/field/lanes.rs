@@ -1,8 +1,8 @@
 //! Compositing of a field in registers: the operations of [`FieldRule::close_pixel`] in its order,
 //! so that every pixel has the same bytes.
 //!
-//! Only pixels beside a face of the volume leave the registers ([`FieldRule::end_at_faces`]): few
-//! do.
+//! Pixels beside a face of the volume, which are few, are finished one by one
+//! ([`FieldRule::end_at_faces`]).
 
 use super::tables::{CELLS, FEW_CELLS, GradientShares, SHARES};
 use super::{FieldRule, FieldScene, Plane, Ray, STEPS, Segment};
@@ -37,7 +37,7 @@ pub(super) fn avx2(
     live: u32,
 ) -> u32 {
     let mut shut = 0;
-    // One call: a second would be compiled as a function of its own.
+    // A loop has one call site, so that `close` is inlined and compiled for the instruction set.
     for from in [0, 8] {
         // SAFETY: this function is compiled for these instructions; a row has sixteen lanes.
         shut |= unsafe { close::<Eight>(rule, looks, row, at, (live >> from, from)) } << from;
@@ -45,14 +45,14 @@ pub(super) fn avx2(
     shut
 }
 
-/// Planes of some pixels, as [`Plane`].
+/// The field at one plane for the pixels of a register ([`Plane`]).
 #[derive(Clone, Copy)]
 struct Planes<F> {
     value: F,
     gradient: [F; 3],
 }
 
-/// Rays of some pixels, as [`Ray`].
+/// The rays of the pixels of a register ([`Ray`]).
 #[derive(Clone, Copy)]
 struct Rays<F> {
     at: [F; 2],
@@ -167,7 +167,7 @@ unsafe fn between<L: Floats>(
         let some = L::both(far, L::below(L::all(1e-6), abs::<L>(sum)));
         let per_sum = div_into_one::<L>(L::select(some, sum, L::all(1.0)));
         let mean = L::div(sum, L::select(far, rise, L::all(1.0)));
-        // Where all go far and meet something nobody looks at middles.
+        // Lanes that use the integrals don't need the sample at the middle.
         let mut looks = match !L::bits(some) & active {
             0 => q,
             _ => at::<L>(&scene.looks, middle),
@@ -180,7 +180,7 @@ unsafe fn between<L: Floats>(
     }
 }
 
-/// The rays of pixels.
+/// Returns the rays of the pixels at columns and rows of the picture.
 #[inline(always)]
 unsafe fn rays<L: Floats>(
     rule: &FieldRule,
@@ -211,7 +211,7 @@ unsafe fn rays<L: Floats>(
     }
 }
 
-/// Raw sums as the field. The value is counted from the background.
+/// Converts raw sums to value (cells above the background) and gradient (cells per vox).
 #[inline(always)]
 unsafe fn plane<L: Floats>(
     rule: &FieldRule,
@@ -242,7 +242,7 @@ unsafe fn sine<L: Floats>(t: L::Floats) -> L::Floats {
     }
 }
 
-/// What is left of phases when whole cycles are taken away, -0.5 to 0.5.
+/// Returns phases without their whole cycles: -0.5 to 0.5 cycles.
 #[inline(always)]
 unsafe fn rest<L: Floats>(phase: L::Floats) -> L::Floats {
     // SAFETY: the caller has these instructions.
@@ -289,8 +289,8 @@ unsafe fn smooth<L: Floats>(
     }
 }
 
-/// Lanes in which the plane at depth `z` is near a face of the volume, or outside the cropping
-/// box.
+/// Returns a bit for each lane whose plane at depth `z` (vox) is near a face of the volume or outside
+/// the cropping box.
 #[inline(always)]
 unsafe fn near<L: Floats>(rule: &FieldRule, rays: &Rays<L::Floats>, z: f32) -> u32 {
     // SAFETY: the caller has these instructions.
@@ -309,7 +309,7 @@ unsafe fn near<L: Floats>(rule: &FieldRule, rays: &Rays<L::Floats>, z: f32) -> u
     }
 }
 
-/// How much a plane's value changes along the rays over one thickness.
+/// Returns the change of a plane's value along the rays over one thickness, in cells.
 #[inline(always)]
 unsafe fn along<L: Floats>(
     rule: &FieldRule,
@@ -524,8 +524,8 @@ unsafe fn close<L: Floats>(
         let mut opacities = load::<L>(&row.a, at_lane);
         let mut light = [zero; 3];
         let (mut value, mut integral, mut j) = (zero, None, 0u32);
-        // From -1 on: that one only computes the value where the segment begins. One place for the
-        // cubic: what is called twice is not compiled for the instructions.
+        // Pass 0 computes the value where the segment begins; pass j adds sub-step j - 1. The cubic
+        // has one call site, so that it is inlined and compiled for the instruction set.
         let mut begin = from;
         let mut end = from;
         loop {

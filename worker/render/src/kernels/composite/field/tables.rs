@@ -16,7 +16,7 @@ pub(super) const SHARES: usize = 1024;
 /// transfer function is taken where the middle is; differences of f32 integrals would lose digits.
 pub(super) const FEW_CELLS: f32 = 16.0;
 
-/// Two parallel faces of the cropping box, along a world axis.
+/// Two parallel faces of the cropping box, perpendicular to a world axis.
 #[derive(Debug)]
 pub(super) struct CropFaces {
     /// World coordinate from the volume's centre, of index coordinates: `along . index + from`.

@@ -16,12 +16,23 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let descriptors = protox::compile(FILES, ["."])?;
     let out = PathBuf::from(std::env::var_os("OUT_DIR").ok_or("cargo sets OUT_DIR")?);
     std::fs::write(out.join("slabcast_descriptor.bin"), descriptors.encode_to_vec())?;
-    // `Bytes` everywhere: a received brick or chunk is a part of the buffer it came in, not a
-    // copy.
-    let mut configured = tonic_prost_build::configure().bytes(".");
-    for field in BOXED {
-        configured = configured.boxed(format!(".slabcast.render.v1.{field}"));
+    // What can't be decoded on a worker's stream was damaged on its way, and is asked for again.
+    for (package, codec) in [
+        ("slabcast.render.v1", "tonic_prost::ProstCodec"),
+        ("slabcast.cluster.v1", "crate::sealed::LenientCodec"),
+    ] {
+        // `Bytes` everywhere: a received brick or chunk is a part of the buffer it came in, not a
+        // copy.
+        let mut configured = tonic_prost_build::configure().bytes(".").codec_path(codec);
+        for field in BOXED.iter().filter(|_| package == "slabcast.render.v1") {
+            configured = configured.boxed(format!(".slabcast.render.v1.{field}"));
+        }
+        let mut part = descriptors.clone();
+        let others = ["slabcast.render.v1", "slabcast.cluster.v1"].map(Some);
+        part.file.retain(|f| {
+            f.package.as_deref() == Some(package) || !others.contains(&f.package.as_deref())
+        });
+        configured.compile_fds(part)?;
     }
-    configured.compile_fds(descriptors)?;
     Ok(())
 }

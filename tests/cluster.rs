@@ -343,7 +343,8 @@ async fn worker_on_the_masters_machine_sends_results_unpacked() {
     use slabcast_common::message::{Hello, ToMaster, ToWorker};
     use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
     use slabcast_proto::{
-        cluster_v1::cluster_service_client::ClusterServiceClient as ClusterClient, convert,
+        cluster_v1::ControlRequest,
+        cluster_v1::cluster_service_client::ClusterServiceClient as ClusterClient, convert, sealed,
     };
     let named = Path::new("/proc/sys/kernel/random/boot_id").exists();
     for (machine, here) in [("", true), ("another", !named)] {
@@ -365,12 +366,15 @@ async fn worker_on_the_masters_machine_sends_results_unpacked() {
         let stream =
             tokio_stream::StreamExt::chain(tokio_stream::once(first), tokio_stream::pending());
         let mut answers = client.control(stream).await.unwrap().into_inner();
+        let (_, opener) = sealed::ends(tokio_stream::empty::<ControlRequest>());
         let answer = answers.message().await.unwrap().expect("an answer");
+        let answer = opener.open(answer).unwrap().expect("it is whole");
         let (welcome, _) = convert::to_worker_from_wire(answer).unwrap();
         assert!(matches!(welcome, ToWorker::Welcome { .. }), "not let in: {welcome:?}");
         let _client = render(dir.path(), &address, "told", "region");
         let told = loop {
             let message = answers.message().await.unwrap().expect("a frame");
+            let message = opener.open(message).unwrap().expect("it is whole");
             if let (ToWorker::Frame { plain, .. }, _) =
                 convert::to_worker_from_wire(message).unwrap()
             {

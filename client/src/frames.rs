@@ -9,7 +9,7 @@ use slabcast_proto::model::{FrameChunk, WatchMessage};
 use slabcast_proto::render_v1 as wire;
 use std::time::Duration;
 use tokio::time::Instant;
-use tonic::Streaming;
+use tonic::{Code, Status, Streaming};
 
 /// Time to wait for a master that is away, unless the caller says otherwise: a restart takes
 /// seconds, reading a large volume again up to a minute.
@@ -29,6 +29,17 @@ const PREALLOCATED_BYTES: usize = 64 << 20;
 
 /// Bytes of the longest trace of one frame.
 const MAX_TRACE_BYTES: usize = 256 << 20;
+
+/// Damaged messages without a whole frame after which the connection counts as broken. A line that
+/// damages half of all frames damages so many in a row once in a million.
+const MOST_DAMAGED: u32 = 20;
+
+/// Whether a stream ended since a message could not be read: what this side says with INTERNAL and
+/// without a source. A master's own INTERNAL ends the next stream as well, until patience is used
+/// up.
+fn is_damage(status: &Status) -> bool {
+    status.code() == Code::Internal
+}
 
 /// An event of a job: news, or a frame.
 #[derive(Clone, Debug, PartialEq)]
@@ -67,6 +78,9 @@ pub struct FrameStream {
     next: u64,
     stream: Option<Open>,
     partial: Option<Partial>,
+    /// Messages that arrived damaged, in all and since the last whole frame.
+    damaged_messages: u64,
+    damaged_in_a_row: u32,
     /// The latest notice.
     latest: Option<JobNotice>,
     /// Whether the master ended the stream with all that was to come.
@@ -102,6 +116,8 @@ impl FrameStream {
             next: from_frame,
             stream: None,
             partial: None,
+            damaged_messages: 0,
+            damaged_in_a_row: 0,
             latest: None,
             over: false,
             patience,
@@ -177,7 +193,11 @@ impl FrameStream {
                     retry_after: None,
                 });
             }
+            Err(status) if is_damage(&status) => return self.damaged(status.message()),
             Err(status) => return Err(ClientError::from_status(self.client.address(), &status)),
+        };
+        let Some(chunk) = convert::watch_checked(chunk) else {
+            return self.damaged("its checksum is false");
         };
         match convert::watch_from_wire(chunk).map_err(|e| self.client.protocol_error(&e))? {
             WatchMessage::Notice(notice) => {
@@ -192,6 +212,32 @@ impl FrameStream {
         }
     }
 
+    /// Drops the stream and what came of the frame, since a message was damaged on its way: the next
+    /// step watches again from that frame.
+    ///
+    /// # Errors
+    /// [`ClientError::Lost`] if that happened [`MOST_DAMAGED`] times without a whole frame.
+    fn damaged(&mut self, cause: &str) -> Result<Option<Update>, ClientError> {
+        self.damaged_messages += 1;
+        self.damaged_in_a_row += 1;
+        self.stream = None;
+        self.partial = None;
+        if self.damaged_in_a_row < MOST_DAMAGED {
+            return Ok(None);
+        }
+        self.damaged_in_a_row = 0;
+        Err(ClientError::Lost {
+            address: self.client.address().to_owned(),
+            cause: format!("frame {} is damaged on its way: {}", self.next, one_line(cause)),
+            retry_after: None,
+        })
+    }
+
+    /// Returns how many messages arrived damaged and were asked for again.
+    pub fn damaged_messages(&self) -> u64 {
+        self.damaged_messages
+    }
+
     /// Whether nothing is missing of a stream that ends here.
     fn has_all(&self) -> bool {
         self.partial.is_none()
@@ -204,7 +250,8 @@ impl FrameStream {
     /// Watches from the first frame that is not whole.
     async fn reopen(&mut self) -> Result<(), ClientError> {
         self.partial = None;
-        let request = wire::WatchFramesRequest { job_id: self.job.clone(), from_frame: self.next };
+        let (job_id, from_frame) = (self.job.clone(), self.next);
+        let request = wire::WatchFramesRequest { job_id, from_frame, checked: true };
         let mut render = self.client.render.clone();
         // Not the call's own deadline: that would end the stream, too.
         let stream = match tokio::time::timeout(ANSWER, render.watch_frames(request)).await {
@@ -270,6 +317,7 @@ impl FrameStream {
         }
         let whole = self.partial.take().expect("a chunk was added to it").finish(self.next)?;
         self.next += 1;
+        self.damaged_in_a_row = 0;
         self.outage = None;
         Ok(Some(whole))
     }

@@ -206,6 +206,7 @@ impl WorkerTable {
             silent: attached.last_heard.elapsed(),
             connected: attached.joined.elapsed(),
             in_reserve: seen.in_reserve,
+            damaged_messages: attached.link.damaged.get(),
         })
     }
 }
@@ -240,12 +241,12 @@ mod tests {
             (
                 Hello { protocol_versions: newer, ..hello() },
                 AttachError::Protocol { worker: newer },
-                ["protocol 8 to 9".into(), format!("master {PROTOCOL_VERSIONS};")],
+                ["protocol 9 to 10".into(), format!("master {PROTOCOL_VERSIONS};")],
             ),
             (
                 Hello { protocol_versions: older, ..hello() },
                 AttachError::Protocol { worker: older },
-                ["protocol 6,".into(), format!("master {PROTOCOL_VERSIONS};")],
+                ["protocol 7,".into(), format!("master {PROTOCOL_VERSIONS};")],
             ),
             (
                 Hello { pixels_version: 99, ..hello() },

@@ -46,8 +46,8 @@ pub(crate) enum Event {
     },
     /// A worker said something.
     Said { worker: WorkerId, message: ToMaster },
-    /// A worker's link ended.
-    Detached { worker: WorkerId, reason: String },
+    /// A worker's link ended. `is_damage`: the line was at fault.
+    Detached { worker: WorkerId, reason: String, is_damage: bool },
     /// A client's request was checked.
     Submit { plan: Box<Plan>, reply: oneshot::Sender<Result<JobId, SubmitError>> },
     /// A job's bricks were cut.
@@ -195,12 +195,16 @@ impl Driver {
                 let _ = reply.send(self.attach(hello, caller, link));
             }
             Event::Said { worker, message } => self.said(worker, message),
-            Event::Detached { worker, reason } => {
+            Event::Detached { worker, reason, is_damage } => {
                 if let Some(is_leaving) = self.workers.remove(worker) {
                     if is_leaving {
                         info!(%worker, "worker left");
                     } else {
-                        warn!(%worker, reason, "worker lost");
+                        warn!(%worker, reason, is_damage, "worker lost");
+                    }
+                    if is_damage {
+                        // The scheduler suspects no tile of a worker that leaves.
+                        self.scheduler.handle(&self.clock, Happened::WorkerLeaving { worker });
                     }
                     self.scheduler.handle(&self.clock, Happened::WorkerLost { worker, reason });
                     self.refresh_states();

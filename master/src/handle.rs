@@ -262,9 +262,10 @@ impl Handle {
         self.inbox.send(Event::Said { worker, message }).await.is_ok()
     }
 
-    /// Tells the driver that a worker's link has ended, and why.
-    pub async fn detach(&self, worker: WorkerId, reason: String) {
-        let _ = self.inbox.send(Event::Detached { worker, reason }).await;
+    /// Tells the driver that a worker's link has ended, and why. `is_damage`: the line was at fault,
+    /// so that no tile is suspected of it.
+    pub async fn detach(&self, worker: WorkerId, reason: String, is_damage: bool) {
+        let _ = self.inbox.send(Event::Detached { worker, reason, is_damage }).await;
     }
 }
 

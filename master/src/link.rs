@@ -12,7 +12,9 @@ use slabcast_common::message::{BrickBatch, Hello, ToMaster, ToWorker};
 use slabcast_proto::convert::Bricks;
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use tokio::sync::mpsc;
+use tracing::warn;
 
 /// An order for one worker's bricks. Orders are carried out in the order in which they are sent.
 pub enum BrickOrder {
@@ -47,6 +49,52 @@ pub struct WorkerLink {
     /// Orders for bricks: at most one for each brick that the worker lacks, as no brick is ordered
     /// twice.
     pub bricks: mpsc::UnboundedSender<BrickOrder>,
+    /// Messages that were damaged on the link.
+    pub damaged: Damaged,
+}
+
+/// Number of messages that were damaged on their way over a link, in either direction. The first of
+/// a link is told in the log.
+#[derive(Clone, Debug, Default)]
+pub struct Damaged(Arc<Counter>);
+
+#[derive(Debug, Default)]
+struct Counter {
+    messages: AtomicU64,
+    worker: String,
+    address: String,
+}
+
+impl Damaged {
+    /// Counts for a worker by its name and address.
+    pub(crate) fn of(worker: String, address: String) -> Damaged {
+        Damaged(Arc::new(Counter { messages: AtomicU64::new(0), worker, address }))
+    }
+
+    /// Adds `messages`.
+    pub(crate) fn add(&self, messages: u64) {
+        let Counter { messages: all, worker, address } = &*self.0;
+        if messages > 0 && all.fetch_add(messages, Ordering::Relaxed) == 0 {
+            warn!(
+                worker,
+                address,
+                "a message was damaged on its way and is sent again; ListWorkers counts more of them"
+            );
+        }
+    }
+
+    /// Returns the number of damaged messages.
+    pub fn get(&self) -> u64 {
+        self.0.messages.load(Ordering::Relaxed)
+    }
+}
+
+/// Why a link ended before its worker closed it.
+pub(crate) struct Broken {
+    /// Reason, for logs.
+    pub(crate) reason: String,
+    /// Whether the line is at fault, and not what the worker was drawing.
+    pub(crate) is_damage: bool,
 }
 
 /// The place that a worker calls from.
@@ -118,11 +166,14 @@ pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
     });
     tokio::spawn(async move {
         let Some(ToMaster::Hello(hello)) = reply_rx.recv().await else { return };
-        let link = WorkerLink { control: control_tx, bricks: order_tx };
+        let link =
+            WorkerLink { control: control_tx, bricks: order_tx, damaged: Damaged::default() };
         let caller = Caller { address: String::new(), is_local: true };
         let broken = async {
             match sending.await {
-                Err(e) if e.is_panic() => "sending bricks to it panicked".to_string(),
+                Err(e) if e.is_panic() => {
+                    Broken { reason: "sending bricks to it panicked".into(), is_damage: false }
+                }
                 // The driver dropped the link, or the worker has gone: the replies tell.
                 _ => std::future::pending().await,
             }
@@ -132,26 +183,15 @@ pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
     EmbeddedEnd { control: control_rx, replies: reply_tx, bricks: batch_rx }
 }
 
-/// Lets a worker in and carries its messages to the driver until either side ends. A worker that
-/// is not let in gets the reason as [`ToWorker::Refused`].
-pub async fn serve_link(
+/// Lets a worker in and carries its messages to the driver until either side ends, or `broken` says
+/// why it can't go on. A worker that is not let in gets the reason as [`ToWorker::Refused`].
+pub(crate) async fn serve_until(
     handle: crate::Handle,
     hello: Hello,
     caller: Caller,
     link: WorkerLink,
     replies: &mut mpsc::Receiver<ToMaster>,
-) {
-    serve_until(handle, hello, caller, link, replies, std::future::pending()).await;
-}
-
-/// Serves a link as [`serve_link`] does, until `broken` gives a reason to detach the worker.
-async fn serve_until(
-    handle: crate::Handle,
-    hello: Hello,
-    caller: Caller,
-    link: WorkerLink,
-    replies: &mut mpsc::Receiver<ToMaster>,
-    broken: impl Future<Output = String>,
+    broken: impl Future<Output = Broken>,
 ) {
     let control = link.control.clone();
     let worker = match handle.attach(hello, caller, link).await {
@@ -169,14 +209,16 @@ async fn serve_until(
                 return None;
             }
         }
-        Some("its link closed".to_string())
+        Some(Broken { reason: "its link closed".into(), is_damage: false })
     };
-    let reason = tokio::select! {
-        reason = carry => reason,
-        reason = broken => Some(reason),
+    let broken = tokio::select! {
+        // First why it broke, since the replies end then as well.
+        biased;
+        broken = broken => Some(broken),
+        broken = carry => broken,
     };
-    if let Some(reason) = reason {
-        handle.detach(worker, reason).await;
+    if let Some(Broken { reason, is_damage }) = broken {
+        handle.detach(worker, reason, is_damage).await;
     }
 }
 

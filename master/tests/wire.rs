@@ -6,12 +6,14 @@ use slabcast_common::volume::Volume;
 use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
 use slabcast_master::{Master, MasterConfig, serve};
 use slabcast_proto::cluster_v1::cluster_service_client::ClusterServiceClient;
+use slabcast_proto::cluster_v1::{ControlRequest, control_response};
 use slabcast_proto::convert;
 use slabcast_proto::render_v1::render_service_client::RenderServiceClient;
 use slabcast_proto::render_v1::{
     Fit, GetJobRequest, JobState, ListJobsRequest, ListWorkersRequest, SubmitPathRequest,
     Turntable, ViewPath, WatchFramesRequest, view_path::Cameras,
 };
+use slabcast_proto::sealed;
 use slabcast_proto::status::{Details, Reason};
 use slabcast_scene::path::Orientation;
 use tokio::net::TcpListener;
@@ -92,7 +94,7 @@ async fn error_details_name_reason_field_and_metadata() {
     let status = render.submit_path(other).await.unwrap_err();
     assert_status(&status, Code::AlreadyExists, Reason::ClientKeyTaken);
 
-    let ask = WatchFramesRequest { job_id, from_frame: 4 };
+    let ask = WatchFramesRequest { job_id, from_frame: 4, checked: false };
     let status = render.watch_frames(ask).await.unwrap_err();
     let details = assert_status(&status, Code::OutOfRange, Reason::FrameBeyondEnd);
     assert_eq!(details.number("frames_total"), Some(3));
@@ -178,8 +180,16 @@ async fn answer(served: &Served, hello: Hello) -> (ToWorker, bool) {
     let stream = tokio_stream::once(first).chain(tokio_stream::pending());
     let mut cluster = ClusterServiceClient::new(served.channel.clone());
     let mut answers = cluster.control(stream).await.unwrap().into_inner();
-    let (answer, _) =
-        convert::to_worker_from_wire(answers.message().await.unwrap().unwrap()).unwrap();
+    let answer = answers.message().await.unwrap().unwrap();
+    // A refusal alone comes without a seal.
+    let answer = match &answer.message {
+        Some(control_response::Message::Sealed(_)) => {
+            let (_, opener) = sealed::ends(tokio_stream::empty::<ControlRequest>());
+            opener.open(answer).expect("it is whole").expect("it is the first")
+        }
+        _ => answer,
+    };
+    let (answer, _) = convert::to_worker_from_wire(answer).unwrap();
     let refused = matches!(answer, ToWorker::Refused { .. });
     (answer, refused && answers.message().await.unwrap().is_none())
 }

@@ -3,7 +3,8 @@
 //! `slabcast/render/v1/*.proto` (clients) and `slabcast/cluster/v1/*.proto` (workers) are the
 //! specification; [`render_v1`] and [`cluster_v1`] are what the compiler made of them. Nobody past
 //! this crate handles those messages: [`convert`] turns them into our own types or refuses,
-//! naming the field, and turns our types into them. [`status`] does the same for errors.
+//! naming the field, and turns our types into them. [`status`] does the same for errors, and
+//! [`sealed`] checks what arrives on a worker's streams before anybody decodes it.
 //!
 //! ```
 //! use slabcast_common::message::ToMaster;
@@ -24,6 +25,7 @@
 
 pub mod convert;
 pub mod model;
+pub mod sealed;
 pub mod status;
 
 /// Generated from `slabcast.render.v1`: master and clients.

@@ -142,6 +142,9 @@ pub struct Worker {
     /// Whether the worker is lent nothing for now, since frames would not be finished sooner with
     /// it.
     pub in_reserve: bool,
+    /// Number of messages that were damaged on their way to or from the worker since it joined, and
+    /// were sent again.
+    pub damaged_messages: u64,
 }
 
 /// A piece of a finished frame on its way to a client.

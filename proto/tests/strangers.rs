@@ -396,9 +396,10 @@ fn bytes_of_hello_and_refused_never_change() {
         }],
         rehearses: true,
         machine: "m".into(),
+        crc32c: 0x0403_0201,
     });
     let golden = [
-        0x0a, 36, // ControlRequest.hello = 1, 36 bytes
+        0x0a, 41, // ControlRequest.hello = 1, 41 bytes
         0x08, 1, // min_protocol_version = 1, varint
         0x10, 2, // max_protocol_version = 2, varint
         0x18, 3, // pixels_version = 3, varint
@@ -413,6 +414,7 @@ fn bytes_of_hello_and_refused_never_change() {
         0x0a, 3, 10, 2, 1, // BrickIds.differences = 1, packed, zigzag
         0x50, 1, // rehearses = 10, varint
         0x5a, 1, b'm', // machine = 11
+        0x65, 1, 2, 3, 4, // crc32c = 12, since protocol 8
     ];
     assert_eq!(ControlRequest { message: Some(hello) }.encode_to_vec(), golden);
 

@@ -9,7 +9,9 @@ use crate::session::{self, Config, Ended, Link};
 use slabcast_common::link::BRICK_BATCHES_IN_FLIGHT;
 use slabcast_common::message::{ToMaster, ToWorker};
 use slabcast_proto::cluster_v1::cluster_service_client::ClusterServiceClient;
+use slabcast_proto::cluster_v1::control_response;
 use slabcast_proto::convert::{self, Compression};
+use slabcast_proto::sealed::{self, StreamError};
 use slabcast_proto::{MAX_BRICKS_MESSAGE, MAX_CONTROL_MESSAGE};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -26,6 +28,9 @@ const CONNECT: Duration = Duration::from_secs(5);
 
 /// First wait before dialling again; it doubles up to [`LONGEST_WAIT`] (cluster.proto).
 const FIRST_WAIT: Duration = Duration::from_millis(100);
+
+/// Time after which a damaged message is asked for again (`cluster.proto`, Seals).
+const ASK_AGAIN: Duration = Duration::from_millis(100);
 
 /// Longest wait before dialling again. A link that lived longer was a good one: the wait after it
 /// is the first again.
@@ -173,6 +178,19 @@ impl From<Status> for Broken {
     }
 }
 
+impl From<StreamError> for Broken {
+    fn from(error: StreamError) -> Self {
+        Broken::Lost(error.to_string())
+    }
+}
+
+/// Logs that messages of a stream were damaged, once a link.
+fn tell_of_damage(stream: &str, damaged: u64, told: &mut bool) {
+    if damaged > 0 && !std::mem::replace(told, true) {
+        warn!(stream, "a message to or from the master was damaged on its way and is sent again");
+    }
+}
+
 /// Serves one link, from its hello to its end.
 async fn link(
     config: &Config,
@@ -219,7 +237,11 @@ async fn carry(
     // Encoded on this runtime thread: handing a message to another thread and back takes some 25
     // us (docs/design/transport.md section 0), and the message of a 64x64 tile 35 us. Of the
     // largest tiles it takes 0.6 ms, during which a ping waits.
-    let outbound = ReceiverStream::new(replies).map({
+    let mut replies = replies;
+    let Some(hello) = replies.recv().await else { return Ok(()) };
+    // A master of any version must be able to read it.
+    let hello = tokio_stream::once(convert::from_worker_to_wire(&hello));
+    let messages = ReceiverStream::new(replies).map({
         let uncompressed = uncompressed.clone();
         move |message| {
             let compression = match uncompressed.load(Ordering::Relaxed) {
@@ -229,6 +251,9 @@ async fn carry(
             convert::from_worker_to_wire_as(&message, compression)
         }
     });
+    let (sealed, opener) = sealed::ends(messages);
+    let outbound = hello.chain(sealed);
+    let mut told = false;
     let mut client = ClusterServiceClient::new(channel)
         .max_decoding_message_size(MAX_CONTROL_MESSAGE)
         .max_encoding_message_size(MAX_CONTROL_MESSAGE);
@@ -243,6 +268,12 @@ async fn carry(
         };
         let message = tokio::select! {
             message = inbound.message() => message,
+            () = tokio::time::sleep(ASK_AGAIN), if opener.is_waiting() => {
+                match opener.ask_again() {
+                    Ok(()) => continue,
+                    Err(e) => break Err(e.into()),
+                }
+            }
             broken = bricks_ended => {
                 bricks_stream = None;
                 break Err(broken);
@@ -252,6 +283,18 @@ async fn carry(
             Ok(Some(message)) => message,
             Ok(None) => break Ok(()),
             Err(status) => break Err(status.into()),
+        };
+        let message = match message.message {
+            // A master of any version may send this, and only this, without a seal.
+            Some(control_response::Message::Refused(_)) => message,
+            _ => match opener.open(message) {
+                Ok(Some(message)) => message,
+                Ok(None) => {
+                    tell_of_damage("control", opener.damaged(), &mut told);
+                    continue;
+                }
+                Err(e) => break Err(e.into()),
+            },
         };
         match convert::to_worker_from_wire(message) {
             Ok((message, session)) => {
@@ -292,13 +335,34 @@ async fn carry_bricks(
     let mut client =
         ClusterServiceClient::new(channel).max_decoding_message_size(2 * MAX_BRICKS_MESSAGE);
     let open = tokio_stream::once(convert::bricks_open_to_wire(session));
-    let outbound = open.chain(tokio_stream::pending());
-    let mut inbound = match client.bricks(outbound).await {
+    let (sealed, opener) = sealed::ends(open.chain(tokio_stream::pending()));
+    let mut told = false;
+    let mut inbound = match client.bricks(sealed).await {
         Ok(response) => response.into_inner(),
         Err(status) => return lost(causes(&status)),
     };
     loop {
-        match inbound.message().await {
+        let message = tokio::select! {
+            message = inbound.message() => message,
+            () = tokio::time::sleep(ASK_AGAIN), if opener.is_waiting() => {
+                match opener.ask_again() {
+                    Ok(()) => continue,
+                    Err(e) => return lost(e.to_string()),
+                }
+            }
+        };
+        let opened = match message {
+            Ok(Some(message)) => match opener.open(message) {
+                Ok(Some(message)) => Ok(Some(message)),
+                Ok(None) => {
+                    tell_of_damage("bricks", opener.damaged(), &mut told);
+                    continue;
+                }
+                Err(e) => return lost(e.to_string()),
+            },
+            other => other,
+        };
+        match opened {
             Ok(Some(message)) => match convert::bricks_from_wire(message) {
                 // A session that has ended needs none. This stream ends with Control, which still
                 // carries its Goodbye.

@@ -74,6 +74,14 @@ pub(crate) fn run(args: &StatusArgs) -> Result<(), Fail> {
             ]
         }));
         table(&mut out, &rows);
+        for w in workers.iter().filter(|w| w.damaged_messages > 0) {
+            let (n, name) = (w.damaged_messages, &w.name);
+            let _ = writeln!(
+                out,
+                "damaged  {n} messages to or from {name} were damaged on their way and sent again: \
+                 look at its network card, cables and switches"
+            );
+        }
     }
     let open: Vec<&Job> = jobs.iter().filter(|j| !j.state.is_final()).collect();
     if open.is_empty() {
@@ -103,6 +111,6 @@ fn worker_json(w: &Worker) -> serde_json::Value {
         "simd": w.simd, "memory_budget_bytes": w.memory_budget_bytes,
         "held_bytes": w.held_bytes, "held_bricks": w.held_bricks, "tasks_lent": w.tasks_lent,
         "tasks_done": w.tasks_done, "silent_ms": ms(w.silent), "here_ms": ms(w.connected),
-        "in_reserve": w.in_reserve,
+        "in_reserve": w.in_reserve, "damaged_messages": w.damaged_messages,
     })
 }

@@ -1,31 +1,41 @@
 //! ClusterService: the two streams of a worker's link.
 
-use super::Responses;
+use super::{GOODBYE, Responses};
 use crate::Handle;
-use crate::link::{BrickOrder, Caller, WorkerLink, serve_link};
+use crate::link::{BrickOrder, Broken, Caller, Damaged, WorkerLink, serve_until};
 use slabcast_common::link::BRICK_BATCHES_IN_FLIGHT;
 use slabcast_common::message::{ToMaster, ToWorker};
 use slabcast_proto::cluster_v1::cluster_service_server::ClusterService;
 use slabcast_proto::cluster_v1::{BricksRequest, BricksResponse, ControlRequest, ControlResponse};
 use slabcast_proto::convert::{self, BrickBatches, Down};
+use slabcast_proto::sealed::{self, Incoming, Seals, StreamError};
 use slabcast_proto::status::Reason;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot};
-use tokio_stream::wrappers::{ReceiverStream, UnboundedReceiverStream};
-use tonic::{Request, Response, Status, Streaming};
+use tokio_stream::StreamExt;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Code, Request, Response, Status, Streaming};
 use tracing::debug;
 
 /// Time that a worker may take from connecting to its hello, and from its welcome to its second
 /// connection.
 const HELLO: Duration = Duration::from_secs(10);
 
+/// Messages of a Control stream that wait for the peer to read. What does not fit waits, not
+/// encoded, in the driver's own channel ([`WorkerLink::control`]).
+const CONTROL_MESSAGES: usize = 64;
+
+/// Time after which a damaged message is asked for again (`cluster.proto`, Seals).
+const ASK_AGAIN: Duration = Duration::from_millis(100);
+
 /// Brick orders of links whose second connection is not there yet, by session.
 type Sessions = Arc<Mutex<BTreeMap<u64, Waiting>>>;
 
 struct Waiting {
     orders: mpsc::UnboundedReceiver<BrickOrder>,
+    damaged: Damaged,
     /// Dropped when the Bricks stream ends; the Control stream watches its other end.
     alive: oneshot::Sender<()>,
 }
@@ -78,16 +88,15 @@ impl ClusterService for Cluster {
             is_local: remote.zip(local).is_some_and(|(remote, local)| remote.ip() == local.ip()),
         };
         let inbound = request.into_inner();
-        // Unbounded for the same reason as `WorkerLink::control`, which it carries on.
-        let (out, outbound) = mpsc::unbounded_channel();
+        let (out, outbound) = mpsc::channel(CONTROL_MESSAGES);
         let (handle, sessions) = (self.handle.clone(), self.sessions.clone());
         tokio::spawn(async move {
             if let Err(status) = control(handle, sessions, &caller, inbound, &out).await {
                 debug!(address = caller.address, status = status.message(), "control ended");
-                let _ = out.send(Err(status));
+                end(&out, status).await;
             }
         });
-        Ok(Response::new(Box::pin(UnboundedReceiverStream::new(outbound))))
+        Ok(Response::new(Box::pin(ReceiverStream::new(outbound))))
     }
 
     async fn bricks(
@@ -95,31 +104,102 @@ impl ClusterService for Cluster {
         request: Request<Streaming<BricksRequest>>,
     ) -> Result<Response<Self::BricksStream>, Status> {
         let mut inbound = request.into_inner();
-        let (out, outbound) = mpsc::channel(BRICK_BATCHES_IN_FLIGHT);
+        // Those that wait are in the channel to the seals, and one is here.
+        let (out, outbound) = mpsc::channel(1);
         let sessions = self.sessions.clone();
         tokio::spawn(async move {
-            let Waiting { orders, alive } = match open_bricks(&mut inbound, &sessions).await {
-                Ok(waiting) => waiting,
-                Err(status) => {
-                    let _ = out.send(Err(status)).await;
-                    return;
-                }
+            let (messages, source) = mpsc::channel(BRICK_BATCHES_IN_FLIGHT);
+            let (sealed, opener) = sealed::ends(ReceiverStream::new(source));
+            let carried = async {
+                let Waiting { orders, alive, damaged } =
+                    open_bricks(&mut inbound, &opener, &sessions).await?;
+                // Nothing more comes up but acknowledgements; the end of that stream is the
+                // worker's.
+                let up = async {
+                    loop {
+                        let before = opener.damaged();
+                        let next = next_message(&mut inbound, &opener).await;
+                        damaged.add(opener.damaged() - before);
+                        match next {
+                            Ok(Some(_)) => {}
+                            Ok(None) => return Ok(()),
+                            Err(status) => return Err(status),
+                        }
+                    }
+                };
+                let ended = tokio::select! {
+                    () = send_bricks(orders, &messages) => Ok(()),
+                    ended = up => ended,
+                };
+                drop(alive);
+                ended
             };
-            // Nothing more comes up; the end of that stream is the worker's.
-            let up = async { while let Ok(Some(_)) = inbound.message().await {} };
-            tokio::select! { () = send_bricks(orders, &out) => {}, () = up => {} }
-            drop(alive);
+            let ended = tokio::select! {
+                ended = carried => ended,
+                () = carry(sealed, &out) => Ok(()),
+            };
+            if let Err(status) = ended {
+                end(&out, status).await;
+            }
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(outbound))))
+    }
+}
+
+/// Sends what leaves a sealed stream until it ends, or the peer is gone.
+async fn carry<M>(
+    mut sealed: impl tokio_stream::Stream<Item = M> + Unpin,
+    out: &mpsc::Sender<Result<M, Status>>,
+) {
+    while let Some(message) = sealed.next().await {
+        if out.send(Ok(message)).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// Ends a stream with a status, unless the peer reads nothing: then it ends without.
+async fn end<M>(out: &mpsc::Sender<Result<M, Status>>, status: Status) {
+    let _ = tokio::time::timeout(GOODBYE, out.send(Err(status))).await;
+}
+
+/// Returns the next message of a sealed stream; `None` at its end.
+///
+/// # Errors
+/// The status of a stream that broke, or DATA_LOSS if a message can't be had whole.
+async fn next_message<M: Seals>(
+    inbound: &mut Streaming<M>,
+    opener: &Incoming<M>,
+) -> Result<Option<M>, Status> {
+    loop {
+        let message = tokio::select! {
+            message = inbound.message() => message?,
+            () = tokio::time::sleep(ASK_AGAIN), if opener.is_waiting() => {
+                opener.ask_again().map_err(unsealed)?;
+                continue;
+            }
+        };
+        let Some(message) = message else { return Ok(None) };
+        if let Some(opened) = opener.open(message).map_err(unsealed)? {
+            return Ok(Some(opened));
+        }
+    }
+}
+
+fn unsealed(error: StreamError) -> Status {
+    match error.is_damage() {
+        true => Status::data_loss(error.to_string()),
+        false => Status::invalid_argument(error.to_string()),
     }
 }
 
 /// Reads the first message of a Bricks stream, and takes its session's orders.
 async fn open_bricks(
     inbound: &mut Streaming<BricksRequest>,
+    opener: &Incoming<BricksRequest>,
     sessions: &Sessions,
 ) -> Result<Waiting, Status> {
-    let first = tokio::time::timeout(HELLO, inbound.message()).await;
+    let first = tokio::time::timeout(HELLO, next_message(inbound, opener)).await;
     let message = first
         .map_err(|_| too_late("no BricksOpen in 10 s"))??
         .ok_or_else(|| out_of_order("BricksOpen must come first"))?;
@@ -133,14 +213,14 @@ async fn open_bricks(
 /// and one message hold, however long the order is.
 async fn send_bricks(
     mut orders: mpsc::UnboundedReceiver<BrickOrder>,
-    out: &mpsc::Sender<Result<BricksResponse, Status>>,
+    out: &mpsc::Sender<BricksResponse>,
 ) {
     while let Some(order) = orders.recv().await {
         match order {
             BrickOrder::Send { set, store, bricks } => {
                 let encoded = bricks.iter().filter_map(|id| store.encoded(*id));
                 for message in BrickBatches::new(&set, encoded) {
-                    if out.send(Ok(message)).await.is_err() {
+                    if out.send(message).await.is_err() {
                         return;
                     }
                 }
@@ -151,7 +231,7 @@ async fn send_bricks(
                     unreachable!("DropBricks goes on the Bricks stream")
                 };
                 for message in messages {
-                    if out.send(Ok(message)).await.is_err() {
+                    if out.send(message).await.is_err() {
                         return;
                     }
                 }
@@ -166,7 +246,7 @@ async fn control(
     sessions: Sessions,
     caller: &Caller,
     mut inbound: Streaming<ControlRequest>,
-    out: &mpsc::UnboundedSender<Result<ControlResponse, Status>>,
+    out: &mpsc::Sender<Result<ControlResponse, Status>>,
 ) -> Result<(), Status> {
     let first = tokio::time::timeout(HELLO, inbound.message()).await;
     let first = first
@@ -180,29 +260,59 @@ async fn control(
     let (orders_tx, orders) = mpsc::unbounded_channel();
     let (alive, mut bricks_ended) = oneshot::channel();
     let session = new_session()?;
-    locked(&sessions).insert(session, Waiting { orders, alive });
-    let link = WorkerLink { control: control_tx, bricks: orders_tx };
+    let damaged = Damaged::of(hello.name.clone(), caller.address.clone());
+    let waiting = Waiting { orders, alive, damaged: damaged.clone() };
+    locked(&sessions).insert(session, waiting);
+    let link = WorkerLink { control: control_tx, bricks: orders_tx, damaged: damaged.clone() };
     let (replies, mut reply_rx) = mpsc::channel(64);
-    let caller = caller.clone();
+    let (broken_tx, broken_rx) = oneshot::channel();
+    let link_caller = caller.clone();
     // A task of its own: it outlives whatever ends below, and then tells the driver.
-    tokio::spawn(async move { serve_link(handle, hello, caller, link, &mut reply_rx).await });
+    tokio::spawn(async move {
+        let broken = async {
+            match broken_rx.await {
+                Ok(broken) => broken,
+                // The replies end with whatever is below, and tell.
+                Err(_) => std::future::pending().await,
+            }
+        };
+        serve_until(handle, hello, link_caller, link, &mut reply_rx, broken).await;
+    });
+    let (messages, source) = mpsc::channel(CONTROL_MESSAGES);
+    let (sealed, opener) = sealed::ends(ReceiverStream::new(source));
     let down = async {
         while let Some(message) = control_rx.recv().await {
-            match convert::to_worker_to_wire(&message, session) {
-                Down::Control(message) => drop(out.send(Ok(message))),
-                Down::Parts(messages) => messages.into_iter().for_each(|m| drop(out.send(Ok(m)))),
+            let parts = match convert::to_worker_to_wire(&message, session) {
+                Down::Control(refused) if matches!(message, ToWorker::Refused { .. }) => {
+                    // A worker of any version must be able to read it.
+                    let _ = out.send(Ok(refused)).await;
+                    continue;
+                }
+                Down::Control(message) => vec![message],
+                Down::Parts(messages) => messages,
                 // The driver sends these with the bricks.
-                Down::Bricks(_) => {}
+                Down::Bricks(_) => continue,
+            };
+            for message in parts {
+                if messages.send(message).await.is_err() {
+                    return;
+                }
             }
         }
+        // What was said last still leaves.
+        drop(messages);
+        std::future::pending::<()>().await;
     };
     let up = async {
-        while let Some(message) = inbound.message().await? {
+        loop {
+            let before = opener.damaged();
+            let next = next_message(&mut inbound, &opener).await;
+            damaged.add(opener.damaged() - before);
+            let Some(message) = next? else { return Ok::<(), Status>(()) };
             if replies.send(convert::from_worker_from_wire(message)?).await.is_err() {
-                break;
+                return Ok(());
             }
         }
-        Ok::<(), Status>(())
     };
     let second_connection = async {
         tokio::time::sleep(HELLO).await;
@@ -211,8 +321,9 @@ async fn control(
         }
     };
     let outcome = tokio::select! {
-        // All that the driver said has left by now, a refusal too.
         () = down => Ok(()),
+        // All that the driver said has left by now, a refusal too.
+        () = carry(sealed, out) => Ok(()),
         outcome = up => outcome,
         _ = &mut bricks_ended => {
             Err(Reason::BricksEnded.status("the Bricks stream ended; say hello again", &[]))
@@ -220,5 +331,15 @@ async fn control(
         () = second_connection => Err(too_late("no Bricks stream in 10 s")),
     };
     locked(&sessions).remove(&session);
+    if let Err(status) = &outcome {
+        let reason = format!("its streams broke: {}", status.message());
+        let _ = broken_tx.send(Broken { reason, is_damage: is_damage(status) });
+    }
     outcome
+}
+
+/// Whether a stream broke because bytes were changed on their way: no tile is to blame for that.
+fn is_damage(status: &Status) -> bool {
+    // Decoding and HTTP/2 fail with INTERNAL on this side; a peer that dies ends a stream otherwise.
+    matches!(status.code(), Code::DataLoss | Code::Internal)
 }

@@ -13,6 +13,7 @@ use slabcast_proto::status::{Reason, invalid_field};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{Semaphore, mpsc};
+use tokio_stream::StreamExt;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 use tracing::info;
@@ -166,7 +167,7 @@ impl RenderService for Render {
         &self,
         request: Request<wire::WatchFramesRequest>,
     ) -> Result<Response<Self::WatchFramesStream>, Status> {
-        let wire::WatchFramesRequest { job_id, from_frame } = request.into_inner();
+        let wire::WatchFramesRequest { job_id, from_frame, checked } = request.into_inner();
         let (job, view) = self.job(&job_id)?;
         if from_frame > view.frames_total {
             let total = view.frames_total;
@@ -188,7 +189,15 @@ impl RenderService for Render {
             // A send that fails: the watcher is gone.
             let _ = send_frames(&handle, watch, view, from_frame, &out).await;
         });
-        Ok(Response::new(Box::pin(ReceiverStream::new(outbound))))
+        let outbound = ReceiverStream::new(outbound);
+        if !checked {
+            return Ok(Response::new(Box::pin(outbound)));
+        }
+        // One at a time, where it leaves: a second copy of no more than one chunk.
+        let with_checksum = |message: Result<WatchFramesResponse, Status>| {
+            message.map(|message| convert::watch_with_checksum(&message))
+        };
+        Ok(Response::new(Box::pin(outbound.map(with_checksum))))
     }
 
     async fn get_job(

@@ -288,6 +288,7 @@ pub fn worker() -> impl Strategy<Value = model::Worker> {
         silent: Duration::from_nanos(n[5]),
         connected: Duration::from_nanos(n[6]),
         in_reserve: m[0] % 2 == 1,
+        damaged_messages: m[0].into(),
     })
 }
 

@@ -1,6 +1,6 @@
 //! The Bricks stream, and lists of brick ids.
 
-use super::{digest_from_wire, required, wire};
+use super::{SEALED_TWICE, digest_from_wire, required, wire};
 use crate::MAX_BRICKS_MESSAGE;
 use crate::convert::{MAX_BRICK_LIST, WireError};
 use bytes::Bytes;
@@ -94,8 +94,12 @@ pub fn bricks_open_to_wire(session: u64) -> wire::BricksRequest {
 /// # Errors
 /// [`WireError`] names the field that is wrong.
 pub fn bricks_open_from_wire(message: wire::BricksRequest) -> Result<u64, WireError> {
-    let wire::bricks_request::Message::Open(open) = required("message", message.message)?;
-    session_from_wire("open.session", open.session)
+    match required("message", message.message)? {
+        wire::bricks_request::Message::Open(open) => {
+            session_from_wire("open.session", open.session)
+        }
+        wire::bricks_request::Message::Sealed(_) => Err(WireError::value("sealed", SEALED_TWICE)),
+    }
 }
 
 fn down(message: wire::bricks_response::Message) -> wire::BricksResponse {
@@ -202,5 +206,6 @@ pub fn bricks_from_wire(message: wire::BricksResponse) -> Result<Bricks, WireErr
             set: key_from_wire("drop.set", &drop.set)?,
             bricks: brick_ids_from_wire("drop.bricks", drop.bricks)?,
         })),
+        Message::Sealed(_) => Err(WireError::value("sealed", SEALED_TWICE)),
     }
 }

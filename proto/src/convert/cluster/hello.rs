@@ -5,6 +5,7 @@ use super::bricks::{
 };
 use super::{WorkerId, wire};
 use crate::convert::{MAX_BRICK_LIST, WireError, name_from_wire, optional_name_from_wire};
+use prost::Message as _;
 use slabcast_common::message::{Hello, ToWorker};
 use slabcast_common::protocol::{MAX_THREADS, ProtocolVersions};
 
@@ -19,7 +20,7 @@ pub(super) fn to_wire(hello: &Hello) -> wire::Hello {
             wire::HeldBricks { set: key_to_wire(set), bricks: Some(brick_ids_to_wire(named)) }
         })
         .collect();
-    wire::Hello {
+    let mut written = wire::Hello {
         min_protocol_version: hello.protocol_versions.oldest,
         max_protocol_version: hello.protocol_versions.newest,
         pixels_version: hello.pixels_version,
@@ -31,10 +32,22 @@ pub(super) fn to_wire(hello: &Hello) -> wire::Hello {
         held,
         rehearses: hello.rehearses,
         machine: hello.machine.clone(),
-    }
+        crc32c: 0,
+    };
+    written.crc32c = crc32c::crc32c(&written.encode_to_vec());
+    written
 }
 
-pub(super) fn from_wire(hello: wire::Hello) -> Result<Hello, WireError> {
+/// First version of the protocol whose hello has a checksum.
+const CHECKED_SINCE: u32 = 8;
+
+pub(super) fn from_wire(mut hello: wire::Hello) -> Result<Hello, WireError> {
+    let crc32c = std::mem::take(&mut hello.crc32c);
+    // Fields that a later version adds are not covered, and were dropped when it was decoded.
+    let is_checked = hello.max_protocol_version >= CHECKED_SINCE || crc32c != 0;
+    if is_checked && crc32c != crc32c::crc32c(&hello.encode_to_vec()) {
+        return Err(WireError::value("crc32c", "is false: the hello was damaged on its way"));
+    }
     if hello.min_protocol_version > hello.max_protocol_version {
         return Err(WireError::value("max_protocol_version", "is below min_protocol_version"));
     }

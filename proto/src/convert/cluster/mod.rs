@@ -26,6 +26,9 @@ use slabcast_common::ids::{Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::message::{ToMaster, ToWorker};
 use std::sync::Arc;
 
+/// Problem of a message that is sealed where it should have been opened (`crate::sealed`).
+const SEALED_TWICE: &str = "is sealed twice, or was not to be sealed";
+
 /// A message for a worker, by the stream that it goes on.
 #[expect(clippy::large_enum_variant, reason = "it is taken apart and sent where it is made")]
 #[derive(Clone, Debug, PartialEq)]
@@ -136,6 +139,7 @@ pub fn from_worker_from_wire(message: wire::ControlRequest) -> Result<ToMaster, 
         Message::Goodbye(goodbye) => {
             ToMaster::Goodbye { reason: reason_from_wire("goodbye.reason", goodbye.reason)? }
         }
+        Message::Sealed(_) => return Err(WireError::value("sealed", SEALED_TWICE)),
     })
 }
 
@@ -240,6 +244,7 @@ pub fn to_worker_from_wire(
         Message::MasterEnding(ending) => ToWorker::MasterEnding {
             reason: reason_from_wire("master_ending.reason", ending.reason)?,
         },
+        Message::Sealed(_) => return Err(WireError::value("sealed", SEALED_TWICE)),
     };
     Ok((message, None))
 }

@@ -136,6 +136,7 @@ pub fn worker_to_wire(worker: &Worker) -> wire::Worker {
         silent_duration: duration_to_wire(worker.silent),
         connected_duration: duration_to_wire(worker.connected),
         in_reserve: worker.in_reserve,
+        damaged_messages: worker.damaged_messages,
     }
 }
 
@@ -159,6 +160,7 @@ pub fn worker_from_wire(worker: wire::Worker) -> Result<Worker, WireError> {
         silent: duration_from_wire("silent_duration", worker.silent_duration)?,
         connected: duration_from_wire("connected_duration", worker.connected_duration)?,
         in_reserve: worker.in_reserve,
+        damaged_messages: worker.damaged_messages,
     })
 }
 

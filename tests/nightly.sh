@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
-# The long campaigns, for nights: bash tests/nightly.sh [mutants|simd|faults|matrix|long]...
+# The long campaigns, for nights: bash tests/nightly.sh [mutants|simd|faults|matrix|flips|long]...
 #
 #   mutants   100,000 mutants of small files through every parser (SLABCAST_MUTANTS)
 #   simd      the renderer's tests on every instruction set of this machine, and its benches once
 #   faults    10,000 seeds of faults in the virtual cluster (SLABCAST_SEEDS)
 #   matrix    every combination of workers, threads, tiles, slabs, culling and links
+#   flips     100,000 flipped bits in each direction of a link, and as many of frames (SLABCAST_FLIPS)
 #   long      tests of commands that take half a minute and more
 #
 # Prints one line for each campaign: its name, ok or FAILED, seconds, and its figure. What each
@@ -28,7 +29,7 @@ campaign() { # campaign NAME FIGURE COMMAND...: FIGURE is an awk program over th
 # Sums the tests of all test programs.
 tests='/^test result:/ { passed += $4; failed += $6 } END { printf "%d tests passed, %d failed", passed, failed }'
 
-[ $# -gt 0 ] || set -- mutants simd faults matrix long
+[ $# -gt 0 ] || set -- mutants simd faults matrix flips long
 for name in "$@"; do
     case $name in
     mutants)
@@ -65,12 +66,17 @@ for name in "$@"; do
         campaign matrix '/^exact: / { line = $0 } END { print line }' \
             cargo run --release --locked -- lab check matrix
         ;;
+    flips)
+        campaign flips '/ flips / { print }' \
+            env SLABCAST_FLIPS="${SLABCAST_FLIPS:-100000}" \
+            cargo test --locked -p slabcast --test noise -- --ignored --nocapture
+        ;;
     long)
         campaign long "$tests" \
             cargo test --locked -p slabcast --test commands -- --ignored error_target thin_sheets
         ;;
     *)
-        echo "nightly: no campaign $name; there are mutants, simd, faults, matrix and long" >&2
+        echo "nightly: no campaign $name; there are mutants, simd, faults, matrix, flips and long" >&2
         exit 2
         ;;
     esac

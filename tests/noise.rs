@@ -1,0 +1,241 @@
+//! Links on which bits flip, and links that swallow bricks: pixels stay true, and nothing hangs.
+//!
+//! A proxy stands between a master and its worker, and between the master and a client. The
+//! campaign of a hundred thousand flips in each direction runs at night (`tests/nightly.sh flips`).
+
+#[path = "support/proxy.rs"]
+mod proxy;
+
+use proxy::{Noise, Place, Proxy, Swallows};
+use sha2::{Digest, Sha256};
+use slabcast_client::{Client, PATIENCE, Update};
+use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::quality::{Quality, Schedule, Work};
+use slabcast_master::jobs::WatchItem;
+use slabcast_master::{Handle, Master, MasterConfig};
+use slabcast_render::Simd;
+use slabcast_scene::path::{Orientation, Turntable, ViewPath};
+use slabcast_scene::request::PathRequest;
+use slabcast_scene::transfer::TransferChoice;
+use slabcast_worker::{BrickCache, Config, Link};
+use std::sync::atomic::Ordering::Relaxed;
+use std::time::{Duration, Instant};
+use tokio::sync::watch;
+
+/// Longest time that a job may take on a noisy link. Without flips it takes a tenth of a second; a
+/// lease lasts a minute.
+const PATIENT: Duration = Duration::from_secs(40);
+
+/// A master that listens, and what stops it.
+struct World {
+    master: Master,
+    address: String,
+    stop: watch::Sender<bool>,
+    jobs: u32,
+}
+
+impl World {
+    async fn new() -> World {
+        let volume = slabcast_volumes::open("formula:spheres:40".as_ref()).expect("a formula");
+        let orientation = Orientation::new(None, None).expect("the defaults");
+        let master = Master::start(MasterConfig::new(volume, orientation)).expect("a master");
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let address = listener.local_addr().expect("it has one").to_string();
+        let (stop, stopped) = watch::channel(false);
+        tokio::spawn(slabcast_master::serve::serve(master.handle(), listener, stopped));
+        World { master, address, stop, jobs: 0 }
+    }
+
+    /// Three frames in another schedule and with another transfer function than the job before, so
+    /// that scenes, directories, bricks, leases of both kinds and results cross the link.
+    fn request(&mut self) -> PathRequest {
+        self.jobs += 1;
+        let name = ["auto", "peer-opaque", "grey"][self.jobs as usize / 2 % 3];
+        let schedule = [Schedule::Region, Schedule::Slab][self.jobs as usize % 2];
+        let turn = Turntable { frames: 3, elevation: 20.0, ..Turntable::default() };
+        PathRequest {
+            client_key: format!("job {}", self.jobs),
+            path: ViewPath::from_turntable([150, 110], turn),
+            transfer: TransferChoice::Name(name.into()),
+            quality: Quality::before(),
+            work: Work { schedule, tile: Some(32), ..Work::default() },
+            format: PixelFormat::Rgba32F,
+            background: Background::Transparent,
+            want_trace: false,
+            want_hash: true,
+        }
+    }
+
+    /// Hashes of a job's frames as the master assembled them.
+    async fn run(&self, request: PathRequest) -> Vec<String> {
+        let handle: Handle = self.master.handle();
+        let job = handle.submit(request).await.expect("a good request");
+        let mut watch = handle.watch(job, 0).expect("it was just submitted");
+        let mut hashes = Vec::new();
+        while let Some(item) = watch.next().await {
+            if let WatchItem::Frame(frame) = item {
+                assert!(frame.stats.poisoned.is_empty(), "{:?}", frame.stats.poisoned);
+                hashes.push(frame.stats.pixels_sha256.clone());
+            }
+        }
+        assert_eq!(hashes.len(), 3, "{:?}", handle.job(job).map(|j| j.state));
+        hashes
+    }
+
+    fn dial(&self, name: &str, address: &str) {
+        let (name, address, stopped) = (name.into(), address.into(), self.stop.subscribe());
+        let config = Config {
+            name,
+            threads: 1,
+            memory_budget_bytes: 64 << 20,
+            simd: Simd::detect(),
+            rehearsal: None,
+            machine: String::new(),
+        };
+        tokio::spawn(slabcast_worker::dial::run(config, address, stopped));
+    }
+}
+
+/// The frames of the jobs to come, from a master whose worker has no link at all.
+async fn truths() -> Vec<Vec<String>> {
+    let mut quiet = World::new().await;
+    let end = slabcast_master::link::embedded(quiet.master.handle());
+    let link = Link { control: end.control, replies: end.replies, bricks: end.bricks };
+    let stopped = quiet.stop.subscribe();
+    tokio::spawn(async move {
+        let config = Config {
+            name: "embedded".into(),
+            threads: 1,
+            memory_budget_bytes: 64 << 20,
+            simd: Simd::detect(),
+            rehearsal: None,
+            machine: String::new(),
+        };
+        slabcast_worker::run(&config, link, &mut BrickCache::default(), stopped).await
+    });
+    let mut truths = Vec::new();
+    for _ in 0..6 {
+        let request = quiet.request();
+        truths.push(quiet.run(request).await);
+    }
+    truths
+}
+
+const NONE: Swallows = |_| false;
+
+/// Runs jobs over a noisy link until all flips were made. Returns the flips up and down, and the
+/// links that it took.
+async fn campaign(seed: u64, flips: u64, one_in: u64, place: Place) -> [u64; 3] {
+    let truths = truths().await;
+    let mut world = World::new().await;
+    let noise = [1, 2].map(|n| Noise::new(seed + n, one_in, flips, place));
+    let [up, down] = noise.clone();
+    let proxy = Proxy::start(world.address.clone(), (up, down), NONE).await;
+    world.dial("noisy", &proxy.address);
+    let (begin, mut damaged, mut slowest) = (Instant::now(), 0, Duration::ZERO);
+    while noise.iter().any(|n| n.left.load(Relaxed) > 0) {
+        let (request, before) = (world.request(), Instant::now());
+        let want = &truths[(world.jobs as usize - 1) % 6];
+        let got = tokio::time::timeout(PATIENT, world.run(request)).await;
+        let flips = noise.each_ref().map(|n| n.flips.load(Relaxed));
+        let got = got.unwrap_or_else(|_| panic!("seed {seed}: hung after {flips:?} flips"));
+        assert_eq!(&got, want, "seed {seed}: false pixels after {flips:?} flips");
+        slowest = slowest.max(before.elapsed());
+        let workers = world.master.handle().workers().await;
+        damaged = damaged.max(workers.iter().map(|w| w.damaged_messages).sum());
+    }
+    let [up, down] = noise.each_ref().map(|n| n.flips.load(Relaxed));
+    let links = proxy.connections.load(Relaxed) as u64 / 2;
+    if links == 1 {
+        assert!(damaged >= flips, "seed {seed}: the master counts {damaged}");
+    }
+    println!(
+        "{up} flips up and {down} down in {} jobs of 3 frames: 0 false, 0 hung; slowest job \
+         {slowest:.1?}, {links} links, {:.1?} in all",
+        world.jobs,
+        begin.elapsed(),
+    );
+    world.stop.send_replace(true);
+    [up, down, links]
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn flipped_bits_on_a_workers_link_change_no_pixel_and_hang_no_frame() {
+    let [up, down, _] = campaign(1, 200, 6, Place::Messages).await;
+    assert_eq!((up, down), (200, 200));
+}
+
+/// Flips in the lengths of messages, too: those end a link.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn flipped_bits_in_lengths_of_messages_end_links_and_no_frame() {
+    let [up, down, links] = campaign(2, 2, 60, Place::Lengths).await;
+    assert_eq!((up, down), (2, 2));
+    assert!(links > 1, "and are not taken for messages");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "minutes; tests/nightly.sh flips"]
+async fn a_hundred_thousand_flips_each_way_change_no_pixel_and_hang_no_frame() {
+    let flips = std::env::var("SLABCAST_FLIPS").map_or(100_000, |n| n.parse().expect("a number"));
+    let [up, down, _] = campaign(3, flips, 4, Place::Messages).await;
+    assert_eq!((up, down), (flips, flips));
+}
+
+/// Watches jobs through a proxy that flips bits of what the master sends to the client.
+async fn watched(seed: u64, flips: u64, one_in: u64) {
+    let truths = truths().await;
+    let mut world = World::new().await;
+    let down = Noise::new(seed, one_in, flips, Place::Messages);
+    let proxy = Proxy::start(world.address.clone(), (Noise::none(), down.clone()), NONE).await;
+    world.dial("quiet", &world.address);
+    let begin = Instant::now();
+    let mut damaged = 0;
+    while down.left.load(Relaxed) > 0 {
+        let request = world.request();
+        let want = truths[(world.jobs as usize - 1) % 6].clone();
+        let direct = Client::connect(&world.address).await.expect("it listens");
+        let job = direct.submit(&request).await.expect("a good request");
+        let got = tokio::time::timeout(PATIENT, async {
+            // A call that is not a watch may fail of a flip.
+            let client = loop {
+                if let Ok(client) = Client::connect(&proxy.address).await {
+                    break client;
+                }
+            };
+            let mut frames = client.follow(&job, 0, PATIENCE).await.expect("it is there");
+            let mut got = Vec::new();
+            while let Some(update) = frames.next().await.expect("a frame in the end") {
+                if let Update::Frame(frame) = update {
+                    let hash: String =
+                        Sha256::digest(&frame.bytes).iter().map(|b| format!("{b:02x}")).collect();
+                    assert_eq!(hash, frame.stats.pixels_sha256, "seed {seed}");
+                    got.push(hash);
+                }
+            }
+            damaged += frames.damaged_messages();
+            got
+        });
+        assert_eq!(got.await.expect("no watch hangs"), want, "seed {seed}");
+    }
+    let flips = down.flips.load(Relaxed);
+    println!(
+        "{flips} flips of frames to a client in {} jobs of 3 frames: 0 false, 0 hung; {damaged} \
+         messages asked for again, {:.1?}",
+        world.jobs,
+        begin.elapsed()
+    );
+    assert!(damaged > 0);
+    world.stop.send_replace(true);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn flipped_bits_of_frames_to_a_client_are_found_and_the_frame_comes_again() {
+    watched(4, 60, 6).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "minutes; tests/nightly.sh flips"]
+async fn many_flips_of_frames_to_a_client_are_found() {
+    let flips = std::env::var("SLABCAST_FLIPS").map_or(100_000, |n| n.parse().expect("a number"));
+    watched(5, flips, 3).await;
+}

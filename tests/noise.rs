@@ -181,6 +181,45 @@ async fn a_hundred_thousand_flips_each_way_change_no_pixel_and_hang_no_frame() {
     assert_eq!((up, down), (flips, flips));
 }
 
+/// The Bricks connection is the second of each link. What large packets do in a router that drops
+/// them: pings go on and bricks do not come.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn link_whose_bricks_are_swallowed_ends_and_the_next_one_draws_the_frame() {
+    let first: Swallows = |connection| connection == 1;
+    let (took, links) = swallowed(first, false).await;
+    assert_eq!(links, 2);
+    assert!(took < PATIENT);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn idle_worker_draws_the_tiles_of_one_whose_bricks_are_always_swallowed() {
+    let all: Swallows = |connection| connection % 2 == 1;
+    let (took, _) = swallowed(all, true).await;
+    assert!(took < PATIENT);
+}
+
+/// Runs a job on a worker behind a proxy that swallows bricks, beside an honest one or alone.
+/// Returns how long it took, and the links of the worker. A lease lasts 60 s.
+async fn swallowed(swallows: Swallows, beside_another: bool) -> (Duration, usize) {
+    let truths = truths().await;
+    let mut world = World::new().await;
+    let noise = (Noise::none(), Noise::none());
+    let proxy = Proxy::start(world.address.clone(), noise, swallows).await;
+    world.dial("stalled", &proxy.address);
+    if beside_another {
+        world.dial("quiet", &world.address);
+    }
+    let workers = 1 + usize::from(beside_another);
+    while world.master.handle().workers().await.len() < workers {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    let (request, before) = (world.request(), Instant::now());
+    let got = tokio::time::timeout(PATIENT, world.run(request)).await.expect("no frame hangs");
+    assert_eq!(got, truths[0]);
+    world.stop.send_replace(true);
+    (before.elapsed(), proxy.connections.load(Relaxed).div_ceil(2))
+}
+
 /// Watches jobs through a proxy that flips bits of what the master sends to the client.
 async fn watched(seed: u64, flips: u64, one_in: u64) {
     let truths = truths().await;

@@ -122,6 +122,9 @@ pub struct RegionSplit {
 /// dropped.
 pub const DIRECTORIES_KEPT: usize = 4;
 
+/// Reason in the goodbye of a worker that ends as it was told to. Any other reason is a fault.
+pub const TOLD_TO_STOP: &str = "told to stop";
+
 /// A message from master to worker.
 #[derive(Clone, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "a view is 400 bytes once a frame and worker")]

@@ -23,7 +23,7 @@ use crate::link::{Caller, WorkerLink};
 use crate::panics::Panicked;
 use crate::record::RecordedScheduler;
 use slabcast_common::ids::{FrameId, JobId, WorkerId};
-use slabcast_common::message::{Hello, SceneSpec, ToMaster, ToWorker};
+use slabcast_common::message::{Hello, SceneSpec, TOLD_TO_STOP, ToMaster, ToWorker};
 use slabcast_common::volume::Volume;
 use slabcast_proto::model::Worker;
 use slabcast_schedule::{Clock, Event as Happened, Micros};
@@ -296,7 +296,11 @@ impl Driver {
             }
             ToMaster::Pong { nonce, clock_us } => Happened::Pong { worker, nonce, clock_us },
             ToMaster::Goodbye { reason } => {
-                info!(%worker, reason, "worker is leaving");
+                if reason == TOLD_TO_STOP {
+                    info!(%worker, reason, "worker is leaving");
+                } else {
+                    warn!(%worker, reason, "worker is leaving");
+                }
                 Happened::WorkerLeaving { worker }
             }
         };

@@ -18,8 +18,8 @@ use slabcast_common::PIXELS_VERSION;
 use slabcast_common::brick::BrickGrid;
 use slabcast_common::ids::{Epoch, FrameId, SceneId, TaskId};
 use slabcast_common::message::{
-    BrickBatch, Hello, Lease, Pixels, RegionCost, RegionLease, TaskTimes, TileResult, ToMaster,
-    ToWorker,
+    BrickBatch, Hello, Lease, Pixels, RegionCost, RegionLease, TOLD_TO_STOP, TaskTimes, TileResult,
+    ToMaster, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::protocol::PROTOCOL_VERSIONS;
@@ -35,6 +35,16 @@ use waiting::{WaitingLease, WaitingLeases};
 
 /// Longest time that a worker which is told to stop waits for the tasks it has begun.
 const DRAIN: Duration = Duration::from_secs(8);
+
+/// Longest time that bricks which tasks wait for may stay away without a single brick coming. The
+/// Bricks stream has a connection of its own, which may stall (a router that swallows large packets)
+/// while pings go on. At half of it, a busy master's pause ends links; at double, a frame waits as
+/// much longer. A link of less than 200 kb/s can't bring a batch in this time.
+const BRICKS_OVERDUE: Duration = Duration::from_secs(3);
+
+/// How often a worker looks whether bricks are overdue. It counts looks and not time, so that a
+/// process that was stopped does not blame its master.
+const LOOKS: u32 = 12;
 
 /// Longest time that a master may take to answer the hello.
 const UNTIL_WELCOME: Duration = Duration::from_secs(10);
@@ -125,6 +135,9 @@ pub async fn run(
     let mut session = Session::new(pool, cache, config.memory_budget_bytes);
     let mut drain_until: Option<tokio::time::Instant> = None;
     let mut are_bricks_open = true;
+    let mut looks = tokio::time::interval(BRICKS_OVERDUE / LOOKS);
+    looks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    let mut looks_without_bricks = 0;
     loop {
         if session.is_leaving && session.in_pool == 0 && session.stalled.is_empty() {
             return Ok(Ended::Stopped);
@@ -156,11 +169,29 @@ pub async fn run(
                     session.on_message(message);
                 }
             },
-            batch = link.bricks.recv(), if are_bricks_open => match batch {
-                Some(Bricks::Batch(batch)) => session.on_bricks(batch),
-                Some(Bricks::Message(message)) => session.on_message(message),
-                None => are_bricks_open = false,
-            },
+            batch = link.bricks.recv(), if are_bricks_open => {
+                looks_without_bricks = 0;
+                match batch {
+                    Some(Bricks::Batch(batch)) => session.on_bricks(batch),
+                    Some(Bricks::Message(message)) => session.on_message(message),
+                    None => are_bricks_open = false,
+                }
+            }
+            _ = looks.tick() => {
+                looks_without_bricks += 1;
+                if !session.waits_for_bricks() {
+                    looks_without_bricks = 0;
+                } else if looks_without_bricks > LOOKS && link.bricks.is_empty() {
+                    let reason = format!(
+                        "no brick came in {} s while tasks waited for some: the second connection \
+                         is stalled",
+                        BRICKS_OVERDUE.as_secs()
+                    );
+                    // Not the tasks are to blame, and the master need not wait for them.
+                    let _ = link.replies.send(ToMaster::Goodbye { reason: reason.clone() }).await;
+                    return Ok(Ended::Lost(reason));
+                }
+            }
             Some(report) = reports.recv() => {
                 session.on_report(report);
                 // Bricks that several regions lack are asked for in one message.
@@ -239,6 +270,11 @@ impl<'a> Session<'a> {
             patience: UNTIL_WELCOME,
             replies: Vec::new(),
         }
+    }
+
+    /// Whether tasks wait for bricks that the master was asked for or announced.
+    fn waits_for_bricks(&self) -> bool {
+        !self.waiting.is_empty() || self.stalls.waits_for_bricks()
     }
 
     // -----------------------------------------------------------------------------------------
@@ -550,7 +586,7 @@ impl<'a> Session<'a> {
     fn leave(&mut self) {
         self.is_leaving = true;
         self.waiting.clear();
-        self.replies.push(ToMaster::Goodbye { reason: "told to stop".into() });
+        self.replies.push(ToMaster::Goodbye { reason: TOLD_TO_STOP.into() });
     }
 
     /// Microseconds on this worker's clock.

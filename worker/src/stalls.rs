@@ -138,6 +138,11 @@ impl Stalls {
         ids
     }
 
+    /// Whether a region waits for bricks that were asked for.
+    pub(crate) fn waits_for_bricks(&self) -> bool {
+        self.regions.values().any(|region| region.asked && !region.missing.is_empty())
+    }
+
     /// Ends a region's claim on bricks.
     fn release(&mut self, set: BrickSetKey, places: impl IntoIterator<Item = u32>) {
         for place in places {

@@ -86,6 +86,11 @@ impl WaitingLeases {
         self.leases.retain(|_, w| w.lease.frame != frame);
     }
 
+    /// Whether no lease waits.
+    pub(super) fn is_empty(&self) -> bool {
+        self.leases.is_empty()
+    }
+
     /// Removes all leases.
     pub(super) fn clear(&mut self) {
         self.leases.clear();

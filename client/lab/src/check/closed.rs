@@ -95,6 +95,7 @@ fn shot(
             height: Some(f64::from(n) / scale),
             fov: None,
         },
+        crop: None,
     })
 }
 

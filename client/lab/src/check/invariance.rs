@@ -16,7 +16,7 @@ use super::invariance_scenes::{
 use super::shot::{ReferenceKind, Shot};
 use glam::DVec3;
 use slabcast_common::image::{Background, Picture};
-use slabcast_common::quality::Quality;
+use slabcast_common::quality::{Classify, Quality};
 use slabcast_common::shade::Light;
 use slabcast_common::transfer::{ColorSpace, TransferFunction};
 use slabcast_render::judge::reference::ErrorFigures;
@@ -30,14 +30,41 @@ use slabcast_session::fail::Fail;
 /// comes to.
 const CUT_OTHERWISE: f64 = 1.0;
 
-/// Returns the cases of the group.
+/// Largest difference of two ways to sum one field, in 1/255: 32-bit sums in units of another range of
+/// codes (types of samples), 32-bit floats of another set of axes. 0.0014 was the largest seen.
+pub(super) const FIELD_SUMS: f64 = 0.01;
+
+/// Largest difference of a field's opacity from the front and from behind, in 1/255. Planes are the
+/// same, but segments are cut into sub-steps from the eye's side, which may cost 0.05, and gradients
+/// count where opacity depends on them. 0.28 was the largest seen.
+const FIELD_FROM_BEHIND: f64 = 0.5;
+
+/// The same as [`CUT_OTHERWISE`] for fields, whose kernel is the wider B-spline. 1.3 was seen.
+const FIELD_LEANS_OTHERWISE: f64 = 2.0;
+
+/// Error of fields that thinner planes don't make smaller, in 1/255: positions are rounded to 1/256
+/// pixel, which turns normals (docs/design/sharp.md).
+const FIELD_FLOOR: f64 = 0.1;
+
+const EFFORT: Effort = Effort { samples: 48, size: [160, 128], pixels: 2000, every: 5 };
+
+/// Returns the cases of the group, classified before reconstruction.
 pub(crate) fn cases() -> Vec<Case> {
-    with(Effort { samples: 48, size: [160, 128], pixels: 2000, every: 5 })
+    with(EFFORT, Classify::Before)
 }
 
-fn with(effort: Effort) -> Vec<Case> {
+/// Returns the same cases, classified after reconstruction.
+pub(super) fn of_fields() -> Vec<Case> {
+    with(EFFORT, Classify::After)
+}
+
+fn with(effort: Effort, order: Classify) -> Vec<Case> {
     let mut cases = Vec::new();
     for scene in [Scene::Opaque, Scene::Translucent, Scene::Stiff, Scene::Boxes] {
+        if order == Classify::After && scene == Scene::Stiff {
+            // Fields are summed in whole numbers alone.
+            continue;
+        }
         let checks: [(&str, Check); 8] = [
             ("unit of length", units),
             ("origin", origins),
@@ -50,13 +77,13 @@ fn with(effort: Effort) -> Vec<Case> {
         ];
         for (name, check) in checks {
             cases.push(Case::new(format!("{name}, {}", scene.name()), move |tools| {
-                check(&InvarianceCase { scene, effort, shot: scene.shot(effort)?, tools })
+                check(&InvarianceCase { scene, effort, shot: scene.shot(effort, order)?, tools })
             }));
         }
     }
     cases.push(Case::new("points on a transfer function's lines", move |tools| {
         let scene = Scene::Opaque;
-        points(&InvarianceCase { scene, effort, shot: scene.shot(effort)?, tools })
+        points(&InvarianceCase { scene, effort, shot: scene.shot(effort, order)?, tools })
     }));
     cases
 }
@@ -128,11 +155,12 @@ fn axes(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
             turned = turned.max(largest(&want, &got));
         }
     }
-    let order = if case.scene == Scene::Stiff { 2.0 * case.rounding() } else { 0.0 };
-    let normals = if case.shot.transfer.shading.on { case.normals() } else { 0.0 };
+    let order = case.other_order();
+    let coded = case.shot.transfer.shading.on && !case.is_field();
+    let normals = if coded { 255.0 * case.normals() } else { 0.0 };
     Ok(vec![
-        Row::new(format!("{LARGEST}: of storage"), stored, 255.0 * order),
-        Row::new(format!("{LARGEST}: with the camera"), turned, 255.0 * (order + normals)),
+        Row::new(format!("{LARGEST}: of storage"), stored, order),
+        Row::new(format!("{LARGEST}: with the camera"), turned, order + normals),
     ])
 }
 
@@ -140,28 +168,37 @@ fn axes(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
 /// far). The camera stays; bricks and the volume's centre move, and with the bricks the order in
 /// which floats are added.
 fn borders(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
+    // A field is divided by the kernel's weight inside the volume, so borders as wide as a turned
+    // kernel count.
+    let base = if case.is_field() { 4 } else { 1 };
     let mut off = 0.0f64;
     for (shot, _) in case.views()? {
-        let want = case.picture(&shot.padded(1))?;
-        for n in [2, 4, 9] {
-            off = off.max(largest(&want, &case.picture(&shot.padded(n))?));
+        let want = case.picture(&shot.padded(base))?;
+        for n in [1, 3, 8] {
+            off = off.max(largest(&want, &case.picture(&shot.padded(base + n))?));
         }
     }
-    let order = if case.scene == Scene::Stiff { 2.0 * case.rounding() } else { 0.0 };
-    Ok(vec![Row::new(LARGEST, off, 255.0 * order)])
+    Ok(vec![Row::new(LARGEST, off, case.other_order())])
 }
 
-/// Values stored as 8-bit codes, 16-bit codes and floats give one picture.
+/// Values stored as 8-bit codes, 16-bit codes and floats give one picture; of a field, whose sums
+/// have units of the range of codes, one up to [`FIELD_SUMS`].
 fn types(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
     if case.scene == Scene::Stiff {
         // Its values have 16 bits, of which floats hold all.
         return Ok(vec![case.same_bytes("u16, f32", |s| vec![s.in_floats()])?]);
     }
-    Ok(vec![
-        case.same_bytes("u8, u16, f32", |s| {
-            vec![s.in_16_bits(1), s.in_16_bits(256), s.in_floats()]
-        })?,
-    ])
+    let others = |s: &Shot| vec![s.in_16_bits(1), s.in_16_bits(256), s.in_floats()];
+    if !case.is_field() {
+        return Ok(vec![case.same_bytes("u8, u16, f32", others)?]);
+    }
+    let mut off = 0.0f64;
+    for (shot, want) in case.views()? {
+        for other in others(&shot) {
+            off = off.max(largest(&want, &case.picture(&other)?));
+        }
+    }
+    Ok(vec![Row::new(format!("{LARGEST}: u8, u16, f32"), off, FIELD_SUMS)])
 }
 
 /// A part of a larger picture; red and blue exchanged; the camera on its side, where weights are
@@ -194,7 +231,12 @@ fn pictures(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
         Picture { size: p.size, pixels }
     };
     let bound = 255.0 * 2.0 * case.rounding();
-    let side_bound = if case.scene == Scene::Boxes { CUT_OTHERWISE } else { bound };
+    let side_bound = match (case.scene, case.is_field()) {
+        (Scene::Boxes, false) => CUT_OTHERWISE,
+        (Scene::Boxes, true) => FIELD_LEANS_OTHERWISE,
+        _ => bound,
+    };
+    let behind_bound = if case.is_field() { FIELD_FROM_BEHIND } else { bound };
     let bytes = |what: &str, got: &Picture| {
         Row::new(format!("{BYTES}: {what}"), pixels_that_differ(&want, got) as f64, 0.0)
     };
@@ -205,7 +247,7 @@ fn pictures(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
         Row::new(
             format!("{LARGEST}: A from behind"),
             largest(&alpha(&upright), &alpha(&behind)),
-            bound,
+            behind_bound,
         ),
     ])
 }
@@ -238,6 +280,9 @@ fn opacity(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
 /// Sheets half as thick are not worse than before by more than 5 %, down to the floor: what
 /// rounded positions and sums leave at that thickness, found against the same sheets in f64.
 fn sheets(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
+    if case.is_field() {
+        return planes(case);
+    }
     let mut rows = Vec::new();
     for at in [0, 2] {
         let (mut shot, _) = case.views()?.swap_remove(at);
@@ -254,6 +299,28 @@ fn sheets(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
             let rmse = |want: &[[f64; 4]]| ErrorFigures::compare(&got, want, black).rmse;
             let (now, floor) = (rmse(&limit), rmse(&same));
             worst = worst.max(now / f64::max(before, floor));
+            before = now;
+        }
+        rows.push(Row::new(format!("RMSE over that before: {}", VIEWS[at].0), worst, 1.05));
+    }
+    Ok(rows)
+}
+
+/// Planes of a field nearer to each other are not worse by more than 5 %, down to [`FIELD_FLOOR`].
+fn planes(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
+    let mut rows = Vec::new();
+    for at in [0, 2] {
+        let (mut shot, _) = case.views()?.swap_remove(at);
+        shot.quality.eps = 0.0;
+        let sample = shot.ready()?.sample(case.effort.pixels);
+        let limit = shot.field_limit(&sample, case.tools)?;
+        let (mut before, mut worst) = (f64::INFINITY, 0.0f64);
+        for thickness in [1.0, 2.0 / 3.0, 0.5, 0.25, 0.125] {
+            shot.quality.thickness = thickness;
+            let ready = shot.ready()?;
+            let got = ready.at(&ready.picture(Cut::on(case.tools.threads)), &sample);
+            let now = ErrorFigures::compare(&got, &limit, Background::Colour([0.0; 3])).rmse;
+            worst = worst.max(now / f64::max(before, FIELD_FLOOR));
             before = now;
         }
         rows.push(Row::new(format!("RMSE over that before: {}", VIEWS[at].0), worst, 1.05));
@@ -317,7 +384,8 @@ mod tests {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
         let tools = Tools { threads: 2, runtime };
         let mut failed = Vec::new();
-        for case in with(effort) {
+        let orders = [Classify::Before, Classify::After];
+        for case in orders.into_iter().flat_map(|order| with(effort, order)) {
             for row in (case.work)(&tools).unwrap() {
                 if !row.held() {
                     failed.push(format!("{}: {row:?}", case.name));

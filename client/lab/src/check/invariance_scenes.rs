@@ -3,10 +3,11 @@
 
 use super::case::Row;
 use super::cases;
+use super::invariance::FIELD_SUMS;
 use super::shot::{Shot, Tools};
 use glam::DVec3;
 use slabcast_common::image::Picture;
-use slabcast_common::quality::Quality;
+use slabcast_common::quality::{Classify, Quality};
 use slabcast_common::shade::Light;
 use slabcast_common::transfer::SIGMA_MAX;
 use slabcast_common::volume::Lattice;
@@ -61,7 +62,11 @@ impl Scene {
         }
     }
 
-    pub(super) fn shot(self, effort: Effort) -> Result<Shot, Fail> {
+    /// Returns the scene in the default quality of an order of classification.
+    ///
+    /// # Errors
+    /// The formula or the preset is refused.
+    pub(super) fn shot(self, effort: Effort, order: Classify) -> Result<Shot, Fail> {
         let n = effort.samples;
         let (formula, n, tf) = match self {
             Scene::Opaque => ("spheres", n, "peer-opaque"),
@@ -84,8 +89,8 @@ impl Scene {
             transfer.shading.on = false;
         }
         let view = view(&volume.lattice, [0.0, 2.0, 0.0], Ortho);
-        let (volume, quality) = (Arc::new(volume), Quality::before());
-        Ok(Shot { volume, transfer, quality, size: effort.size, view })
+        let (volume, quality) = (Arc::new(volume), Quality::of(order));
+        Ok(Shot { volume, transfer, quality, size: effort.size, view, crop: None })
     }
 }
 
@@ -148,6 +153,20 @@ impl InvarianceCase<'_> {
             }
         }
         Ok(Row::new(format!("{BYTES}: {what}"), most as f64, 0.0))
+    }
+
+    /// Whether values are reconstructed first and classified then.
+    pub(super) fn is_field(&self) -> bool {
+        self.shot.quality.classify == Classify::After
+    }
+
+    /// Largest difference, in 1/255, of sums that are added in another order.
+    pub(super) fn other_order(&self) -> f64 {
+        match self.scene {
+            _ if self.is_field() => FIELD_SUMS,
+            Scene::Stiff => 255.0 * 2.0 * self.rounding(),
+            _ => 0.0,
+        }
     }
 
     /// Returns the number of sheets that the volume takes at most.

@@ -16,6 +16,7 @@ mod colour_rule;
 mod convergence;
 mod enclose;
 mod extreme;
+mod fields;
 mod golden;
 mod invariance;
 mod invariance_scenes;
@@ -38,7 +39,7 @@ use slabcast_session::fail::Fail;
     args_conflicts_with_subcommands = true,
     after_long_help = "\
 Examples:
-  slabcast lab check                            every case of the table: two minutes
+  slabcast lab check                            every case of the table: four minutes
   slabcast lab check --group extreme --long     one group, with its long cases
   slabcast lab check --list                     names of the cases
   slabcast lab check matrix --pairwise          every pair of settings at least once: minutes

@@ -7,19 +7,21 @@
 use super::cluster::{self, Link, TestCluster};
 use slabcast_common::image::Picture;
 use slabcast_common::message::SceneSpec;
-use slabcast_common::quality::{Quality, Sums, Work};
+use slabcast_common::quality::{Keep, Quality, Sums, Work};
 use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
-use slabcast_render::judge::reference::{Reference, stratified};
+use slabcast_render::judge::reference::{FieldReference, Reference, stratified};
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
-use slabcast_scene::path::{Orientation, PathView, ViewPath};
+use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::path::{Crop, Orientation, PathView, ViewPath};
 use slabcast_scene::request::PathRequest;
 use slabcast_session::direct::{self, Bricks, Cut};
 use slabcast_session::embedded::WorkerGroup;
 use slabcast_session::fail::Fail;
 use slabcast_session::path_scenes::SceneBricks;
+use slabcast_volumes::BrickStore;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -46,6 +48,8 @@ pub(crate) struct Shot {
     pub(crate) size: [u32; 2],
     /// The camera, in world units.
     pub(crate) view: PathView,
+    /// Box outside of which nothing is drawn.
+    pub(crate) crop: Option<Crop>,
 }
 
 /// Returns `quality` with sums of 32 bits or floats where they are automatic: errors judged here
@@ -73,7 +77,7 @@ pub(crate) struct PreparedShot {
 
 impl Shot {
     fn path(&self) -> ViewPath {
-        ViewPath::from_views(self.size, vec![self.view])
+        ViewPath { crop: self.crop.clone(), ..ViewPath::from_views(self.size, vec![self.view]) }
     }
 
     /// Returns the request that has a cluster draw the shot.
@@ -97,9 +101,30 @@ impl Shot {
         let camera = self.path().camera(0, &info.lattice, orientation).map_err(refused)?;
         let view = View::new(&info.lattice, &camera, self.size, &self.quality).map_err(refused)?;
         let quality = with_precise_sums(self.quality, &self.transfer, &info);
+        let needs = BrickNeeds::for_path(&self.path(), &self.transfer, None, &info, &quality)
+            .map_err(refused)?;
         let SceneBricks { spec, bricks } =
-            SceneBricks::new(&self.volume, &info, &self.transfer, quality)?;
+            SceneBricks::with_requirements(&self.volume, &info, &self.transfer, quality, &needs)?;
         Ok(PreparedShot { spec, view, bricks })
+    }
+
+    /// Returns the limit of a shot that is classified after reconstruction at `sample`, linear
+    /// premultiplied RGBA. It is computed from all voxels, stored or not.
+    ///
+    /// # Errors
+    /// If a master would refuse the request.
+    pub(crate) fn field_limit(
+        &self,
+        sample: &[[u32; 2]],
+        tools: &Tools,
+    ) -> Result<Vec<[f64; 4]>, Fail> {
+        let PreparedShot { spec, view, .. } = self.ready()?;
+        let all = BrickNeeds::default().with_kept(Keep { empty: true, ..Keep::default() });
+        let bricks = BrickStore::build(&self.volume, spec.volume.digest, &all);
+        let reference = FieldReference::new(&spec, view, &Bricks::from_store(&bricks));
+        Ok(direct::map_parallel(sample.len(), tools.threads, |i, _: &mut ()| {
+            reference.pixel(sample[i][0], sample[i][1])
+        }))
     }
 
     /// Draws the shot with the serial renderer, on threads in odd tiles and slabs, by an embedded

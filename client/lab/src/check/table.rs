@@ -6,7 +6,7 @@
 
 use super::case::{Case, Row};
 use super::shot::Tools;
-use super::{closed, extreme, invariance};
+use super::{closed, extreme, fields, invariance};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress::{self, Progress};
 use slabcast_session::request::ThreadArgs;
@@ -39,6 +39,12 @@ pub(crate) const GROUPS: &[Group] = &[
         name: "invariance",
         about: "what must not matter (units, origin, axes, storage), and what must matter one way",
         cases: invariance::cases,
+    },
+    Group {
+        name: "fields",
+        about: "pictures that are classified after reconstruction: known on paper, and what must \
+                not matter to them",
+        cases: fields::cases,
     },
 ];
 

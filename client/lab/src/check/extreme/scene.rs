@@ -6,12 +6,13 @@ use crate::check::shot::{PreparedShot, ReferenceKind, Shot, Tools, largest, sane
 use glam::DVec3;
 use slabcast_common::bounds;
 use slabcast_common::brick::TightBox;
-use slabcast_common::image::Picture;
+use slabcast_common::image::{Background, Picture};
 use slabcast_common::quality::{Compositing, Quality};
 use slabcast_common::shade::Shading;
 use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::view::Projection;
 use slabcast_common::volume::{Lattice, Volume};
+use slabcast_render::judge::reference::ErrorFigures;
 use slabcast_scene::path::{PathView, ProjectionKind};
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
@@ -20,6 +21,12 @@ use std::sync::Arc;
 /// Largest error of the reference itself, in 1/255: 7e-5 at its tolerance, by its own
 /// documentation.
 const JUDGE: f64 = 1e-3;
+
+/// Thickness of the planes whose pictures of fields are held against the limit, in vox.
+const FIELD_THIN: f64 = 0.125;
+
+/// Largest RMSE of such planes against the limit, in 1/255.
+const FIELD_RMSE: f64 = 0.3;
 
 /// A transfer function: blue where values are small, orange where they are large; unshaded.
 /// `opacities` are alphas of one vox.
@@ -78,7 +85,14 @@ pub(super) fn on_lattice(volume: Volume, spacing: [f64; 3], origin: [f64; 3]) ->
 /// `volume` as `transfer` shows it, from an oblique direction, orthographic.
 pub(super) fn shot(volume: Volume, transfer: TransferFunction) -> Shot {
     let view = ortho_camera(&volume, [0.53, 0.71, 0.36], [0.0, 0.0, 1.0]);
-    Shot { volume: Arc::new(volume), transfer, quality: Quality::before(), size: [61, 47], view }
+    Shot {
+        volume: Arc::new(volume),
+        transfer,
+        quality: Quality::before(),
+        size: [61, 47],
+        view,
+        crop: None,
+    }
 }
 
 /// The orthographic camera that sees all of `volume` from direction `to_eye`.
@@ -109,13 +123,58 @@ pub(super) fn persp_camera(volume: &Volume, eye: [f64; 3], target: [f64; 3], fov
     }
 }
 
+/// Judges `shot` in both orders of classification.
+pub(super) fn judge(shot: &Shot, pixels: usize, tools: &Tools) -> Result<Vec<Row>, Fail> {
+    let mut rows = judge_before(shot, pixels, tools)?;
+    let quality = Quality { eps: shot.quality.eps, ..Quality::default() };
+    rows.extend(judge_field(&Shot { quality, ..shot.clone() }, pixels, tools)?);
+    Ok(rows)
+}
+
+/// Draws `shot`, which is classified after reconstruction, everywhere and once more with nothing shut;
+/// judges a sample of `pixels` by the limit.
+///
+/// What the cut-off leaves out is within its bound, on every pixel. With nothing shut, thinner planes
+/// come as near to the limit as [`FIELD_RMSE`], or nearer than those of the default by a quarter. That is
+/// not judged where there is NaN, which the limit leaves out and sheets take for an invisible code, nor
+/// where a pixel is larger than a vox, since positions are rounded to 1/256 pixel.
+fn judge_field(shot: &Shot, pixels: usize, tools: &Tools) -> Result<Vec<Row>, Fail> {
+    let ready = shot.ready()?;
+    let (picture, trouble) = shot.everywhere(&ready, tools)?;
+    let open = Shot { quality: Quality { eps: 0.0, ..shot.quality }, ..shot.clone() };
+    let drawn = open.ready()?.picture(Cut::on(tools.threads));
+    let left_out = largest_difference(&picture, &drawn);
+    let sample = ready.sample(pixels);
+    let limit = open.field_limit(&sample, tools)?;
+    let mut errors = Vec::new();
+    for thickness in [shot.quality.thickness, FIELD_THIN] {
+        let quality = Quality { thickness, ..open.quality };
+        let ready = Shot { quality, ..open.clone() }.ready()?;
+        let got = ready.at(&ready.picture(Cut::on(tools.threads)), &sample);
+        errors.push(ErrorFigures::compare(&got, &limit, Background::Colour([0.0; 3])));
+    }
+    let [at_default, thin] = [errors[0].rmse, errors[1].rmse];
+    let mut rows = vec![
+        Row::new("field: max that the cut-off leaves out", left_out, cutoff_bound(&ready))
+            .with(trouble)
+            .with(sane_within(&picture, slack(&ready)))
+            .with(sane_within(&drawn, slack(&ready))),
+    ];
+    let coarse = matches!(ready.view.projection, Projection::Ortho { scale } if scale < 1.0);
+    if !coarse && ready.spec.volume.summary.nan == 0 {
+        let bound = f64::max(FIELD_RMSE, 0.75 * at_default);
+        rows.push(Row::new("field: RMSE of planes of 1/8 vox", thin, bound));
+    }
+    Ok(rows)
+}
+
 /// Draws `shot` everywhere, and twice more with nothing shut; judges a sample of `pixels`.
 ///
 /// Three things must hold. What the cut-off leaves out is within its bound, on every pixel. With
 /// nothing shut, a pixel is no farther from its own sheets in f64 than its enclosure says. And
 /// where rays are parallel its opacity, which does not depend on the thickness of sheets at all,
 /// is no farther from the limit than that.
-pub(super) fn judge(shot: &Shot, pixels: usize, tools: &Tools) -> Result<Vec<Row>, Fail> {
+fn judge_before(shot: &Shot, pixels: usize, tools: &Tools) -> Result<Vec<Row>, Fail> {
     let ready = shot.ready()?;
     let (picture, trouble) = shot.everywhere(&ready, tools)?;
     let open = ready.with(Quality { eps: 0.0, ..ready.spec.quality });

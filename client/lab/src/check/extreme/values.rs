@@ -76,3 +76,21 @@ fn unit() -> TransferFunction {
         ..look(&[[0.0, 0.0]])
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::check::shot::Tools;
+
+    #[test]
+    fn constant_and_endless_values_are_drawn_alike_everywhere() {
+        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
+        let tools = Tools { threads: 2, runtime };
+        let some = ["constant", "nothing but denormals", "f32 from end to end"];
+        for case in cases().iter().filter(|c| some.contains(&c.name.as_str())) {
+            for row in (case.work)(&tools).unwrap() {
+                assert!(row.held(), "{}: {row:?}", case.name);
+            }
+        }
+    }
+}

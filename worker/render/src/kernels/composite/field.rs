@@ -138,6 +138,8 @@ pub struct FieldRule {
     /// Raw units of a sum for one code; times the lattice's cell and over the factors of the
     /// weights, for payloads.
     scale: f32,
+    /// Factor of codes before the background is taken away, which has it too ([`shrink`]).
+    shrink: f32,
     background: f32,
     smallest: f32,
     largest: f32,
@@ -213,8 +215,8 @@ impl FieldRule {
         // Raw units of a sum for one code: 2^15 and 2^30 with some room for the kernel's ripple.
         let short = quality.sums == Sums::I16;
         let (units, steps) = match short {
-            true => (30_600.0 / scene.span(), spread),
-            false => (1e9 / scene.span(), DVec3::ONE),
+            true => (30_600.0 / scene.reach(), spread),
+            false => (1e9 / scene.reach(), DVec3::ONE),
         };
         let per_raw = sign * cells / units;
         let lean = view.kernel_lean;
@@ -264,16 +266,18 @@ impl FieldRule {
             Lamp { to_light: Vec3::new(d.x as f32, d.y as f32, d.z as f32), fill }
         });
         let payload = if short { spread.x * spread.y * spread.z } else { 1.0 };
+        let shrink = shrink(scene);
         FieldRule {
-            scale: (units * view.cell / payload) as f32,
-            background: scene.background as f32,
+            scale: (units * view.cell / payload / shrink) as f32,
+            shrink: shrink as f32,
+            background: (scene.background * shrink) as f32,
             smallest: scene.range[0] as f32,
             largest: scene.range[1] as f32,
             kind: scene.kind,
             cell: [((scene.background - scene.hull[0]) * cells) as f32, per_raw as f32],
             slopes,
-            flat: (FLAT_GRADIENT * scene.span() * cells) as f32,
-            range_per_cell: (255.0 / (cells * scene.span())) as f32,
+            flat: (FLAT_GRADIENT * scene.span * cells) as f32,
+            range_per_cell: (255.0 / (cells * scene.span)) as f32,
             thickness: view.thickness as f32,
             faces,
             crop: crop.collect(),
@@ -307,11 +311,13 @@ impl FieldRule {
             SampleKind::U8 | SampleKind::U16 => bits as f32,
             SampleKind::F32 => {
                 let code = f32::from_bits(bits);
-                let code = if code.is_nan() { self.background } else { code };
+                if code.is_nan() {
+                    return 0.0;
+                }
                 code.clamp(self.smallest, self.largest)
             }
         };
-        (code - self.background).abs() * self.scale
+        (code * self.shrink - self.background).abs() * self.scale
     }
 
     /// The ray of the pixel at a column and a row of the picture.
@@ -384,8 +390,9 @@ impl FieldRule {
             outside |= (q < faces.lo) | (q > faces.hi);
             let [lo, lo_slope] = beside_face(table, q - faces.lo);
             let [hi, hi_slope] = beside_face(table, faces.hi - q);
-            let weight = (lo * hi).max(LEAST_WEIGHT);
-            let slope = (lo_slope * hi - lo * hi_slope) / weight;
+            // What lies beyond either face is missing: exact however thin the volume is.
+            let weight = (lo - (1.0 - hi)).max(LEAST_WEIGHT);
+            let slope = (lo_slope - hi_slope) / weight;
             plane.value /= weight;
             for (gradient, along) in plane.gradient.iter_mut().zip(faces.along) {
                 *gradient = *gradient / weight - plane.value * slope * along;
@@ -612,6 +619,14 @@ impl FieldRule {
         shader.terms(&mut lambert, &mut gloss, 1);
         [lambert[0], gloss[0]]
     }
+}
+
+/// A power of two by which codes are multiplied before the background is taken away, so that neither
+/// overflows nor vanishes in 32 bits: 1 but for values beyond 2^60 or below 2^-60.
+fn shrink(scene: &FieldScene) -> f64 {
+    let [lo, hi] = scene.range.map(f64::abs);
+    let power = libm::ilogb(lo.max(hi).max(scene.span));
+    if (-60..60).contains(&power) { 1.0 } else { libm::ldexp(1.0, (-power).clamp(-126, 126)) }
 }
 
 /// Weight of the kernel on the inner side of a face at this distance from it, and its slope.

@@ -56,10 +56,16 @@ impl GradientShares {
     }
 }
 
+/// How far below the smallest code the background lies where the smallest and the largest are visible,
+/// in shares of all codes. It costs sums this share of their precision; a constant volume needs more
+/// than nothing.
+const BELOW: f64 = 1.0 / 64.0;
+
 /// Values of a scene: how codes become sums, and what values look like.
 #[derive(Debug)]
 pub struct FieldScene {
-    /// Code of which a sheet holds nothing: the smallest code of the volume, or the largest.
+    /// Code of which a sheet holds nothing: the smallest code of the volume or the largest, whichever is
+    /// invisible; below the smallest if both are visible.
     pub(super) background: f64,
     /// Samples along each index axis.
     pub(super) dims: [u32; 3],
@@ -67,6 +73,8 @@ pub struct FieldScene {
     pub(super) crop: Vec<CropFaces>,
     /// Smallest and largest code.
     pub(super) range: [f64; 2],
+    /// Codes from the smallest to the largest; of a constant volume a length that is not zero.
+    pub(super) span: f64,
     /// Codes of the first and the last cell's ends.
     pub(super) hull: [f64; 2],
     /// Cells between which values are visible: a visible end of the hull has no end.
@@ -87,9 +95,14 @@ impl FieldScene {
     pub fn new(spec: &SceneSpec, classifier: &Classifier) -> FieldScene {
         let summary = &spec.volume.summary;
         let support = classifier.support();
-        let background = match support.filled(summary).intervals.first() {
+        let end = match support.filled(summary).intervals.first() {
             Some((lo, _)) if *lo == f64::NEG_INFINITY => summary.max_code,
             _ => summary.min_code,
+        };
+        // A sheet without a value gets nothing, so samples that equal the background must be invisible.
+        let background = match classifier.optics_at(end)[0] > 0.0 {
+            true => summary.min_code - span(summary) * BELOW,
+            false => end,
         };
         let hull = hull(classifier, summary);
         let code = |cell: usize| hull[0] + (hull[1] - hull[0]) * (cell as f64 / CELLS as f64);
@@ -111,8 +124,7 @@ impl FieldScene {
             }
             integrals.push(sum);
         }
-        let span = (summary.max_code - summary.min_code).max(f64::MIN_POSITIVE);
-        let cells_of_range = span * CELLS as f64 / (hull[1] - hull[0]);
+        let cells_of_range = span(summary) * CELLS as f64 / (hull[1] - hull[0]);
         let mut most = 0.0f64;
         let sample = |[sigma, rgb @ ..]: [f64; 4]| OpticalSample {
             sigma: sigma as f32,
@@ -132,6 +144,7 @@ impl FieldScene {
             dims: lattice.dims,
             crop: crop.filter(|f| f.ends.iter().any(|end| end.is_finite())).collect(),
             range: [summary.min_code, summary.max_code],
+            span: span(summary),
             hull,
             visible,
             kind: summary.kind,
@@ -155,10 +168,18 @@ impl FieldScene {
         self.hull[0] + value / self.cells_per_code()
     }
 
-    /// Codes from the smallest to the largest.
-    pub(super) fn span(&self) -> f64 {
-        (self.range[1] - self.range[0]).max(f64::MIN_POSITIVE)
+    /// Largest difference of a code from the background.
+    pub(super) fn reach(&self) -> f64 {
+        let [lo, hi] = self.range.map(|end| (end - self.background).abs());
+        // All codes are one invisible one.
+        if lo.max(hi) > 0.0 { lo.max(hi) } else { self.span }
     }
+}
+
+/// Codes from the smallest to the largest; of a constant volume a length that is not zero.
+fn span(summary: &ValueSummary) -> f64 {
+    let span = summary.max_code - summary.min_code;
+    if span > 0.0 { span } else { summary.max_code.abs().max(1.0) }
 }
 
 /// A table of all cells' ends.
@@ -178,7 +199,7 @@ fn hull(classifier: &Classifier, summary: &ValueSummary) -> [f64; 2] {
     let beside = if summary.kind == SampleKind::F32 { 0.0 } else { 1.0 };
     let clamp = |code: f64| code.clamp(summary.min_code, summary.max_code);
     let [lo, hi] = [clamp(lo - beside), clamp(hi + beside)];
-    if hi > lo { [lo, hi] } else { [lo, lo + 1.0] }
+    if hi > lo { [lo, hi] } else { [lo, lo + span(summary)] }
 }
 
 impl FieldScene {

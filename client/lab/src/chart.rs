@@ -1,24 +1,19 @@
 //! Charts as SVG and as PNG, on a light and on a dark ground.
 //!
-//! Drawn by plotters: its SVG writer, and its bitmap writer with a font that is part of the
-//! program, since a node of a cluster may have none. One drawing function serves both; [`Sheet`]
-//! hides the writer and the size of a pixel. Text is measured in the same font, so that labels
-//! never overlap.
+//! Drawn by plotters: its SVG writer, and its bitmap writer, whose letters are our own
+//! ([`crate::letters`]). One drawing function serves both; [`Sheet`] hides the writer and the size
+//! of a pixel. Text is measured in the same font, so that labels never overlap.
 
-use ab_glyph::{Font, FontRef, ScaleFont};
+use crate::letters::{self, Way};
 use plotters::coord::Shift;
 use plotters::prelude::*;
-use plotters::style::{FontStyle, register_font};
 use slabcast_session::fail::Fail;
 use slabcast_session::output::write_atomic;
 use std::io::Write;
 use std::path::Path;
-use std::sync::Once;
-
-static FONT: &[u8] = include_bytes!("../fonts/DejaVuSans.ttf");
 
 /// Font families for SVG viewers; the first is that of the PNGs.
-const FAMILY: &str = "DejaVu Sans, Verdana, sans-serif";
+pub(crate) const FAMILY: &str = "DejaVu Sans, Verdana, sans-serif";
 
 /// Pixels of the PNG for one of the SVG along each edge. At 1, charts look coarse on screens.
 const PNG_SCALE: u32 = 2;
@@ -91,7 +86,15 @@ pub(crate) trait Draw {
 pub(crate) struct Sheet<'a, DB: DrawingBackend> {
     area: &'a DrawingArea<DB, Shift>,
     scale: f64,
+    /// Whether text is drawn letter by letter, since the writer has no letters.
+    letters: bool,
 }
+
+/// Size of text in ems, for one of plotters, which gives SVG viewers this much.
+const EM: f64 = 1.0 / 1.24;
+
+/// How far the middle of small letters is above the base line, for a size of plotters.
+const MIDDLE: f64 = 0.22;
 
 /// The part of a text that is at its position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -205,20 +208,26 @@ where
         anchor: Anchor,
         colour: RGBColor,
     ) -> Result<(), Failed> {
-        let wide = width(text, size);
+        let wide = letters::width(text, size * EM);
         let left = match anchor {
             Anchor::Left => x,
             Anchor::Middle => x - wide / 2.0,
             Anchor::Right => x - wide,
         };
-        // Both writers put a text's top at its place, each with its own notion of a top. Only the
-        // base line is the same; plotters knows it for SVG alone by an offset of its own.
-        let style = (family(), size * self.scale).into_font().color(&colour);
+        if self.letters {
+            return self.draw_letters(text, (left, y), size, Way::Right, colour);
+        }
+        // plotters knows the base line by an offset of its own.
+        let style = (FAMILY, size * self.scale).into_font().color(&colour);
         let style = style.pos(plotters::style::text_anchor::Pos::new(
             plotters::style::text_anchor::HPos::Left,
             plotters::style::text_anchor::VPos::Bottom,
         ));
-        self.area.draw(&Text::new(text.to_owned(), self.pixel((left, y + size * 0.22)), style))?;
+        self.area.draw(&Text::new(
+            text.to_owned(),
+            self.pixel((left, y + size * MIDDLE)),
+            style,
+        ))?;
         Ok(())
     }
 
@@ -230,7 +239,11 @@ where
         size: f64,
         colour: RGBColor,
     ) -> Result<(), Failed> {
-        let font = (family(), size * self.scale).into_font().transform(FontTransform::Rotate270);
+        if self.letters {
+            let start = (x + size * MIDDLE, y + letters::width(text, size * EM) / 2.0);
+            return self.draw_letters(text, start, size, Way::Up, colour);
+        }
+        let font = (FAMILY, size * self.scale).into_font().transform(FontTransform::Rotate270);
         let style = font.color(&colour).pos(plotters::style::text_anchor::Pos::new(
             plotters::style::text_anchor::HPos::Center,
             plotters::style::text_anchor::VPos::Center,
@@ -238,15 +251,28 @@ where
         self.area.draw(&Text::new(text.to_owned(), self.pixel((x, y)), style))?;
         Ok(())
     }
+
+    /// Draws a line of text letter by letter, its base line from a position.
+    fn draw_letters(
+        &self,
+        text: &str,
+        (x, y): (f64, f64),
+        size: f64,
+        way: Way,
+        colour: RGBColor,
+    ) -> Result<(), Failed> {
+        let start = (x * self.scale, y * self.scale);
+        letters::draw(text, size * EM * self.scale, start, way, |at, covered| {
+            self.area.draw_pixel(at, &colour.mix(covered))
+        })?;
+        Ok(())
+    }
 }
 
-/// Returns the width of a text in pixels.
+/// Returns the room for a text along a line, in pixels. A quarter wider than it is in our font, as
+/// some of the fonts are that an SVG viewer may put in its place.
 pub(crate) fn width(text: &str, size: f64) -> f64 {
-    let Ok(font) = FontRef::try_from_slice(FONT) else { return text.len() as f64 * size * 0.6 };
-    // `size` is that of the em; `as_scaled` takes the height of the font.
-    let em = font.units_per_em().unwrap_or(2048.0);
-    let font = font.as_scaled(size as f32 * font.height_unscaled() / em);
-    text.chars().map(|c| f64::from(font.h_advance(font.glyph_id(c)))).sum()
+    letters::width(text, size)
 }
 
 /// A rectangle in pixels.
@@ -317,16 +343,6 @@ pub(crate) fn place(
     None
 }
 
-/// Registers the font on first use and returns its family.
-pub(crate) fn family() -> &'static str {
-    static ONCE: Once = Once::new();
-    ONCE.call_once(|| {
-        // If registering fails, drawing fails, too, and tests would see it.
-        let _ = register_font(FAMILY, FontStyle::Normal, FONT);
-    });
-    FAMILY
-}
-
 /// Draws a chart as SVG.
 ///
 /// # Errors
@@ -336,7 +352,7 @@ pub(crate) fn svg(chart: &impl Draw, theme: &Theme) -> Result<String, String> {
     let mut draw = || -> Result<(), Failed> {
         let area = SVGBackend::with_string(&mut svg, chart.size()).into_drawing_area();
         area.fill(&theme.ground)?;
-        chart.draw(&Sheet { area: &area, scale: 1.0 }, theme)?;
+        chart.draw(&Sheet { area: &area, scale: 1.0, letters: false }, theme)?;
         area.present()?;
         Ok(())
     };
@@ -356,7 +372,7 @@ pub(crate) fn pixels(chart: &impl Draw, theme: &Theme) -> Result<Pixels, String>
     let mut draw = || -> Result<(), Failed> {
         let area = BitMapBackend::with_buffer(&mut bytes, (wide, high)).into_drawing_area();
         area.fill(&theme.ground)?;
-        chart.draw(&Sheet { area: &area, scale: f64::from(scale) }, theme)?;
+        chart.draw(&Sheet { area: &area, scale: f64::from(scale), letters: true }, theme)?;
         area.present()?;
         Ok(())
     };

@@ -6,7 +6,7 @@
 //!
 //! The background is opaque and light, so that a figure looks the same on a light and a dark page.
 
-use crate::chart::family;
+use crate::chart::FAMILY;
 use plotters::coord::Shift;
 use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, ValueFormatter};
 use plotters::prelude::*;
@@ -131,7 +131,7 @@ impl LogLog {
         root.fill(&GROUND)?;
         let (top, rest) = root.split_vertically(TITLE);
         let (middle, bottom) = rest.split_vertically(PANEL.1);
-        let font = (family(), 17).into_font().color(&INK);
+        let font = (FAMILY, 17).into_font().color(&INK);
         top.draw(&Text::new(self.title.clone(), (16, 10), font))?;
         let (x, y) = self.ranges();
         for (area, panel) in middle.split_evenly((1, n as usize)).iter().zip(&self.panels) {
@@ -181,7 +181,7 @@ impl LogLog {
         x: [f64; 2],
         y: [f64; 2],
     ) -> Result<(), Failed> {
-        let style = |size: i32, colour: &RGBColor| (family(), size).into_font().color(colour);
+        let style = |size: i32, colour: &RGBColor| (FAMILY, size).into_font().color(colour);
         let mut chart = ChartBuilder::on(area)
             .caption(&panel.title, style(14, &INK))
             .margin_right(14)
@@ -270,7 +270,7 @@ fn legend(area: &DrawingArea<SVGBackend<'_>, Shift>, series: &[Series]) -> Resul
                 _ => area.draw(&Circle::new((x + 12, y), 4, colour.filled()))?,
             }
         }
-        let font = (family(), 13).into_font().color(&INK);
+        let font = (FAMILY, 13).into_font().color(&INK);
         area.draw(&Text::new(s.name.clone(), (x + 30, y - 6), font))?;
         x += wide(s) + gap;
     }

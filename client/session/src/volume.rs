@@ -44,7 +44,7 @@ pub struct InputArgs {
     #[arg(long, value_name = "N", allow_negative_numbers = true, help_heading = HEADING,
           hide_short_help = true)]
     level: Option<u32>,
-    /// Most bytes of samples that a Zarr level may have [default: a quarter of the free memory]
+    /// Most bytes that the samples may take [default: 1 GiB or 64 times the file, in free memory]
     #[arg(long, value_name = "BYTES", value_parser = parse::memory, help_heading = HEADING,
           hide_short_help = true)]
     max_bytes: Option<u64>,

@@ -2,13 +2,14 @@
 //! of them, with skips and encodings.
 
 use crate::error::{OpenErrorKind, Problem, quoted};
+use crate::limit::ByteCap;
 use crate::samples::{self, DIM_MAX, Layout, SKIP_MAX_BYTES, Supply};
-use crate::source::{self, Source};
+use crate::source::{self, Folder, Source};
 use crate::unpack::{Encoding, wrapped};
 use slabcast_common::volume::{Samples, ValueMap};
 use std::collections::VecDeque;
 use std::io::{BufRead, Read, Seek, SeekFrom};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Longest header: room for ten thousand lines, since some programs write thousands of DICOM fields
 /// into one. Bounds the memory for a header that does not end.
@@ -84,22 +85,24 @@ pub(crate) fn read(
     storage: &Storage,
     layout: &Layout,
 ) -> Result<(Samples, ValueMap), Problem> {
+    let cap = source.cap;
     let (mut reader, supply) = open(source, len, storage, layout, layout.bytes())?;
-    samples::read(&mut *reader, supply, &storage.decoded_layout(layout))
+    samples::read(&mut *reader, supply, &storage.decoded_layout(layout), cap)
 }
 
 /// Reads the samples from files in the header's folder or below it; each holds an equal share.
-/// `field` is the header's name for them.
+/// `field` is the header's name for them, `cap` the limit of all together.
 pub(crate) fn read_files(
     folder: &Path,
-    names: &[String],
-    field: &str,
+    (names, field): (&[String], &str),
+    cap: ByteCap,
     storage: &Storage,
     layout: &Layout,
 ) -> Result<(Samples, ValueMap), Problem> {
     let in_file = |name: &str| format!("{field} {}", quoted(name));
+    let folder = Folder::open(folder, field)?;
     if let [name] = names {
-        let source = Source::open(&source::resolve_in_folder(folder, name, field)?, field)?;
+        let source = Source { cap, ..folder.named(name, field)? };
         let len = source.len;
         return read(source, len, storage, layout).map_err(|mut p| {
             p.field = in_file(name);
@@ -120,8 +123,7 @@ pub(crate) fn read_files(
     let mut parts = VecDeque::with_capacity(names.len());
     let mut total: Option<Supply> = None;
     for name in names {
-        let path = source::resolve_in_folder(folder, name, field)?;
-        let source = Source::open(&path, field)?;
+        let source = folder.named(name, field)?;
         let len = source.len;
         let name_file = |mut p: Problem| {
             p.field = in_file(name);
@@ -141,11 +143,11 @@ pub(crate) fn read_files(
             ) => Supply::Encoded { name, bytes: before + bytes, ratio },
             (Some(encoded), Supply::Plain { .. }) => encoded,
         });
-        parts.push_back(Part { name: in_file(name), path });
+        parts.push_back(Part { shown: in_file(name), name });
     }
     let supply = total.expect("there is a file");
-    let mut files = FileChain { parts, storage, layout, share, current: None };
-    samples::read(&mut files, supply, &storage.decoded_layout(layout)).map_err(|mut p| {
+    let mut files = FileChain { folder: &folder, parts, storage, layout, share, current: None };
+    samples::read(&mut files, supply, &storage.decoded_layout(layout), cap).map_err(|mut p| {
         if p.field == "data" {
             p.field = field.into();
         }
@@ -226,15 +228,17 @@ fn open<'a>(
     Ok((reader, supply))
 }
 
-struct Part {
+struct Part<'a> {
     /// The field and the file's name, for messages.
-    name: String,
-    path: PathBuf,
+    shown: String,
+    /// Name in the folder.
+    name: &'a str,
 }
 
 /// Reads files one after another; each is opened when its turn comes.
 struct FileChain<'a> {
-    parts: VecDeque<Part>,
+    folder: &'a Folder,
+    parts: VecDeque<Part<'a>>,
     storage: &'a Storage,
     layout: &'a Layout,
     /// Bytes of samples in each file.
@@ -247,12 +251,14 @@ impl Read for FileChain<'_> {
     fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
         loop {
             let Some((name, reader, left)) = &mut self.current else {
-                let Some(Part { name, path }) = self.parts.pop_front() else { return Ok(0) };
+                let Some(Part { shown: name, name: file }) = self.parts.pop_front() else {
+                    return Ok(0);
+                };
                 let name_file = |mut p: Problem| {
                     p.field = name.clone();
                     wrapped(p)
                 };
-                let source = Source::open(&path, "data").map_err(name_file)?;
+                let source = self.folder.named(file, "data").map_err(name_file)?;
                 let len = source.len;
                 let (reader, _) =
                     open(source, len, self.storage, self.layout, self.share).map_err(name_file)?;

@@ -4,6 +4,7 @@
 #[cfg(feature = "dicom")]
 use crate::dicom;
 use crate::error::{OpenErrorKind, Problem, quoted};
+use crate::source::{Folder, Inside};
 #[cfg(feature = "zarr")]
 use crate::zarr;
 use crate::{Hints, Opened, tiff_stack};
@@ -31,13 +32,12 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     {
         let slices = matching(dicom::sniff);
         if !slices.is_empty() {
-            let (series, reader) = (hints.series.as_deref(), hints.dicom_reader.as_deref());
-            return dicom::open(&slices, folder, series, None, reader);
+            return dicom::open(&slices, folder, hints, None);
         }
     }
     let pictures = matching(tiff_stack::sniff);
     if !pictures.is_empty() {
-        return Ok(tiff_stack::read_files(pictures, &name, &hints.raw)?.into());
+        return Ok(tiff_stack::read_files(pictures, &name, &hints.raw, hints.cap())?.into());
     }
     // Suggest volume files that the user may have meant.
     const ENDS: [&str; 9] =
@@ -64,13 +64,7 @@ pub(crate) fn open_series_of(file: &Path, hints: &Hints) -> Result<Opened, Probl
     // Spelt as in the folder's list, which is compared with it.
     let file = folder.join(file.file_name().unwrap_or_default());
     let slices = dicom_files(folder)?;
-    let mut opened = dicom::open(
-        &slices,
-        folder,
-        hints.series.as_deref(),
-        hints.series.is_none().then_some(&*file),
-        hints.dicom_reader.as_deref(),
-    )?;
+    let mut opened = dicom::open(&slices, folder, hints, hints.series.is_none().then_some(&*file))?;
     let name = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let count = opened.volume.lattice.dims[2];
     if count > 1 {
@@ -90,14 +84,31 @@ pub(crate) fn dicom_files(folder: &Path) -> Result<Vec<PathBuf>, Problem> {
 
 /// Returns the files of a folder in the order of the numbers in their names, each with its first
 /// 136 bytes. Leaves out hidden files and folders.
+///
+/// Links are followed inside the folder alone. One that leads out is refused, not left out: a slice
+/// would be missing from the picture.
 fn files(folder: &Path) -> Result<Vec<(PathBuf, Vec<u8>)>, Problem> {
     let io = |e: &std::io::Error| Problem::io("folder", e);
+    let inside = Folder::open(folder, "folder")?;
+    let leads_to_file = |entry: &std::fs::DirEntry| match inside.find(entry.file_name().as_ref()) {
+        Ok(Inside::Out) => {
+            let shown = quoted(&entry.file_name().to_string_lossy());
+            Err(Problem::new(
+                OpenErrorKind::Forbidden,
+                "folder",
+                format!("{shown} is a link that leads out of it, and was not followed"),
+                "copy the file into the folder, or take the link away",
+            ))
+        }
+        found => Ok(matches!(found, Ok(Inside::File(..)))),
+    };
     let mut paths = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(|e| io(&e))? {
         let entry = entry.map_err(|e| io(&e))?;
         let hidden = entry.file_name().to_string_lossy().starts_with('.');
-        // Links are followed; pipes are never opened.
-        if !hidden && std::fs::metadata(entry.path()).is_ok_and(|m| m.is_file()) {
+        let kind = entry.file_type().map_err(|e| io(&e))?;
+        // Pipes are never opened.
+        if !hidden && (kind.is_file() || kind.is_symlink() && leads_to_file(&entry)?) {
             paths.push(entry.path());
         }
         if paths.len() > FILES_MAX {

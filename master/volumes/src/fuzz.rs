@@ -173,7 +173,7 @@ impl Rng {
 }
 
 /// Returns a figure of `/proc/self/status` in KiB; 0 where the system has none.
-fn resident_kib(name: &str) -> u64 {
+pub(crate) fn resident_kib(name: &str) -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find(|l| l.starts_with(name)).unwrap_or_default();
     line.split_ascii_whitespace().nth(1).and_then(|n| n.parse().ok()).unwrap_or(0)

@@ -48,6 +48,7 @@ pub mod formula;
 pub mod framing;
 #[cfg(test)]
 mod fuzz;
+mod limit;
 mod metaimage;
 mod nifti;
 mod nrrd;
@@ -71,8 +72,9 @@ pub use raw::RawHints;
 pub use sketch::histogram_sketch;
 pub use store::BrickStore;
 
+use limit::ByteCap;
 use slabcast_common::volume::Volume;
-use source::Source;
+use source::{Folder, Inside, Source};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -91,11 +93,18 @@ pub struct Hints {
     /// Program and first arguments of the process that parses DICOM by calling `dicom::serve`.
     /// `None` parses in a thread of this process, without limits on memory and time.
     pub dicom_reader: Option<Vec<std::ffi::OsString>>,
-    /// Level of a Zarr pyramid, 0 the finest. `None` takes the finest that fits `max_bytes`.
+    /// Level of a Zarr pyramid, 0 the finest. `None` takes the finest that fits `max_bytes`, or a
+    /// quarter of the free memory.
     pub level: Option<u32>,
-    /// Most bytes that the samples of a Zarr array may have, in the file's type. `None` allows
-    /// three quarters of the free memory for an array and a quarter for a level of a pyramid.
+    /// Most bytes that the samples may have, in the file's type. `None` allows 1 GiB or 64 times
+    /// the file's bytes, whichever is more, within three quarters of the free memory.
     pub max_bytes: Option<u64>,
+}
+
+impl Hints {
+    fn cap(&self) -> ByteCap {
+        ByteCap { asked: self.max_bytes }
+    }
 }
 
 /// A volume and the reader's notes on how it was read.
@@ -146,7 +155,7 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
         not(feature = "dicom"),
         expect(unused_mut, reason = "only the DICOM check reads the head")
     )]
-    let mut source = Source::open(path, "file")?;
+    let mut source = Source { cap: hints.cap(), ..Source::open(path, "file")? };
     #[cfg(feature = "dicom")]
     if dicom::sniff(source.head()?) && hints.raw.dims.is_none() {
         return folder::open_series_of(path, hints);
@@ -161,7 +170,7 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
     if error.kind == OpenErrorKind::NotAVolume
         && let Some(header) = header_beside(path)
     {
-        let source = Source::open(&header, "file")?;
+        let source = Source { cap: hints.cap(), ..Source::open(&header, "file")? };
         let header_name = header.file_name().unwrap_or_default().to_string_lossy();
         let volume = read(source, folder, &header_name, hints).map_err(|mut p| {
             p.field = format!("its header {}: {}", error::quoted(&header_name), p.field);
@@ -176,9 +185,12 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
 /// Returns the header beside a data file: of the same stem, with the data file's name inside.
 fn header_beside(path: &Path) -> Option<PathBuf> {
     let name = path.file_name()?.to_str()?;
+    let folder = Folder::open(path.parent()?, "file").ok()?;
     let stem = name.split('.').next().filter(|stem| !stem.is_empty())?;
     ["mhd", "nhdr"].iter().find_map(|end| {
         let header = path.with_file_name(format!("{stem}.{end}"));
+        // A link out of the folder may be anything.
+        let Ok(Inside::File(..)) = folder.find(Path::new(header.file_name()?)) else { return None };
         let mut source = Source::open(&header, "file").ok()?;
         let head = source.head().ok()?;
         let names = head.windows(name.len()).any(|w| w == name.as_bytes());

@@ -39,7 +39,10 @@ pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volu
             let len = source.len.saturating_sub(header_bytes);
             data::read(source, len, &storage, &layout)?
         }
-        Some(names) => data::read_files(folder, &names, "ElementDataFile", &storage, &layout)?,
+        Some(names) => {
+            let names = (&names[..], "ElementDataFile");
+            data::read_files(folder, names, source.cap, &storage, &layout)?
+        }
     };
     Ok(Volume::new(name, layout.number.name(), anatomical, lattice, samples, map))
 }

@@ -24,7 +24,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// Reads a volume from the start of a source.
 pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Problem> {
-    let len = source.len;
+    let (len, cap) = (source.len, source.cap);
     let mut reader: Box<dyn Read + Send> =
         if gzip { Box::new(MultiGzDecoder::new(source.reader)) } else { Box::new(source.reader) };
     let reader = &mut *reader;
@@ -58,7 +58,7 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
         true => Supply::deflate("gzip", len),
         false => Supply::Plain { have: len.saturating_sub(size as u64 + skip) },
     };
-    let (samples, stored) = samples::read(reader, supply, &layout)?;
+    let (samples, stored) = samples::read(reader, supply, &layout, cap)?;
     let map = header.value_map(stored);
     let volume = Volume::new(name, layout.number.name(), anatomical, lattice, samples, map);
     let (lo, hi) = volume.summary.range();

@@ -36,7 +36,8 @@ pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volu
             data::read(source, len, &header.storage, &header.layout)
         }
         Some(files) => {
-            data::read_files(folder, files, "data file", &header.storage, &header.layout)
+            let files = (&files[..], "data file");
+            data::read_files(folder, files, source.cap, &header.storage, &header.layout)
         }
     };
     let (samples, map) = samples?;

@@ -15,6 +15,7 @@
 //! samples floats. The shift by the minimum keeps the span.
 
 use crate::error::{OpenErrorKind, Problem};
+use crate::limit::ByteCap;
 use crate::wide;
 use slabcast_common::brick::{BrickGrid, MAX_BRICKS};
 use slabcast_common::volume::{Samples, ValueMap};
@@ -202,12 +203,14 @@ impl Layout {
     }
 }
 
-/// Reads the samples. Takes memory only for bytes that are known to exist. Reads compressed data
-/// one byte past the declared size, to find surplus data and wrong checksums.
+/// Reads the samples, if `cap` allows their size. Takes memory only for bytes that are known to
+/// exist. Reads compressed data one byte past the declared size, to find surplus data and wrong
+/// checksums.
 pub(crate) fn read(
     reader: &mut (dyn Read + Send),
     supply: Supply,
     layout: &Layout,
+    cap: ByteCap,
 ) -> Result<(Samples, ValueMap), Problem> {
     let need = layout.bytes();
     match supply {
@@ -225,6 +228,8 @@ pub(crate) fn read(
         }
         _ => {}
     }
+    let (Supply::Plain { have: stored } | Supply::Encoded { bytes: stored, .. }) = supply;
+    cap.check(need, stored, "size")?;
     let bytes = ByteReader { reader, supply, need, received: 0 };
     let mut data = NumberReader { bytes, size: layout.number.bytes() as usize };
     let big = layout.endian == Endian::Big;

@@ -7,6 +7,7 @@
 //! wrote one. Resolutions alone are ignored, since picture programs fill in 72 dpi.
 
 use crate::error::{OpenErrorKind, Problem, quoted};
+use crate::limit::ByteCap;
 use crate::raw::RawHints;
 use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
 use crate::source::{Source, Stream};
@@ -33,7 +34,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// Reads the pages of one file as slices.
 pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Volume, Problem> {
-    let len = source.len;
+    let (len, cap) = (source.len, source.cap);
     let mut pages = TiffFile::open(source)?;
     let first = pages.page()?;
     let mut count = 1;
@@ -57,14 +58,15 @@ pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Volum
         consumed: 0,
         row: 0,
     };
-    finish(stack, count, len, name, hints.spacing.or(spacing))
+    finish(stack, count, (len, cap), name, hints.spacing.or(spacing))
 }
 
-/// Reads TIFF files, in the order given, as slices of a volume called `name`.
+/// Reads TIFF files, in the order given, as slices of a volume called `name`, of at most `cap`.
 pub(crate) fn read_files(
     files: Vec<PathBuf>,
     name: &str,
     hints: &RawHints,
+    cap: ByteCap,
 ) -> Result<Volume, Problem> {
     let (mut first, mut spacing, mut total) = (None, None, 0);
     let count = files.len() as u64;
@@ -108,13 +110,13 @@ pub(crate) fn read_files(
         consumed: 0,
         row: page.height,
     };
-    finish(stack, count, total, name, hints.spacing.or(spacing))
+    finish(stack, count, (total, cap), name, hints.spacing.or(spacing))
 }
 
 fn finish(
     mut stack: Stack,
     count: u64,
-    len: u64,
+    (len, cap): (u64, ByteCap),
     name: &str,
     spacing: Option<[f64; 3]>,
 ) -> Result<Volume, Problem> {
@@ -126,7 +128,7 @@ fn finish(
     lattice.check().map_err(|e| Problem::malformed("spacing", e, "give it with --spacing"))?;
     // LZW is the densest encoding read: a code of 12 bits stands for at most 4096 bytes.
     let supply = Supply::Encoded { name: "TIFF", bytes: len, ratio: 4096 };
-    let (samples, map) = samples::read(&mut stack, supply, &layout)?;
+    let (samples, map) = samples::read(&mut stack, supply, &layout, cap)?;
     Ok(Volume::new(name, number.name(), false, lattice, samples, map))
 }
 

@@ -3,7 +3,7 @@
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
-use slabcast_volumes::{OpenErrorKind, open};
+use slabcast_volumes::{Hints, OpenErrorKind, open, open_with};
 use std::io::Write;
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -74,11 +74,11 @@ fn detached_data_outside_the_header_folder_are_refused() {
         point_at(name).unwrap();
         let (kind, line) = refusal(&header);
         assert_eq!(kind, OpenErrorKind::Forbidden, "{line}");
-        assert!(line.contains("data file") && line.contains("put the data file beside"), "{line}");
+        assert!(line.contains("data file") && line.contains("put the data file beside its header"), "{line}");
     }
     for name in ["/etc/passwd", "/dev/zero", "nothing.raw", "below", "."] {
         point_at(name).unwrap();
-        refusal(&header);
+        assert_eq!(refusal(&header).0, OpenErrorKind::Forbidden, "{name}");
     }
     for (name, code) in [("d.raw", 2.0), ("./below/d.raw", 3.0), ("below/../d.raw", 2.0)] {
         point_at(name).unwrap();
@@ -118,7 +118,97 @@ fn symlinks_out_pipes_and_devices_are_refused_unread() {
     point_at("pipe.raw").unwrap();
     let (kind, line) = refusal(&header);
     assert_eq!(kind, OpenErrorKind::Forbidden, "{line}");
-    assert!(line.contains("is a pipe, socket or device, and was not read"), "{line}");
+    assert!(line.contains("is a folder, pipe, socket or device, and was not read"), "{line}");
+}
+
+#[cfg(unix)]
+#[test]
+fn refusal_does_not_tell_whether_a_file_outside_exists() {
+    let dir = tempfile::tempdir().unwrap();
+    let inside = dir.path().join("study");
+    std::fs::create_dir_all(&inside).unwrap();
+    std::fs::write(dir.path().join("secret.raw"), [1; 24]).unwrap();
+    let link = |target: &str| {
+        let path = inside.join("link.raw");
+        let _ = std::fs::remove_file(&path);
+        std::os::unix::fs::symlink(target, path).unwrap();
+    };
+    let header = inside.join("v.nhdr");
+    let absolute = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let ask = |name: &str| {
+        std::fs::write(&header, format!("{HEADER}data file: {name}\n")).unwrap();
+        let (kind, line) = refusal(&header);
+        (kind, line.replace(name, "NAME"))
+    };
+    let missing = ask("missing.raw");
+    for [there, not] in [
+        ["../secret.raw".to_string(), "../nothing.raw".to_string()],
+        ["/etc/passwd".into(), "/etc/nothing-of-this-name".into()],
+        [absolute("secret.raw"), absolute("nothing.raw")],
+        ["../secret.raw/below".into(), "../nothing/below".into()],
+    ] {
+        assert_eq!(ask(&there), missing, "{there}");
+        assert_eq!(ask(&not), missing, "{not}");
+        link(&there);
+        let found = ask("link.raw");
+        link(&not);
+        assert_eq!(ask("link.raw"), found, "{there} and {not} behind a link");
+        assert_eq!(found, missing);
+        // Of several files, in a list.
+        for name in [there, not] {
+            let list = format!("{HEADER}data file: LIST\n{name}\n{name}\n");
+            std::fs::write(&header, list).unwrap();
+            let (kind, line) = refusal(&header);
+            assert_eq!((kind, line.replace(&name, "NAME")), missing, "{name}");
+        }
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn folder_with_a_link_that_leads_out_is_refused_whatever_is_there() {
+    let dir = tempfile::tempdir().unwrap();
+    let inside = dir.path().join("stack");
+    std::fs::create_dir_all(&inside).unwrap();
+    std::fs::write(dir.path().join("secret.tif"), b"II*\0").unwrap();
+    let link = |target: &str| {
+        let path = inside.join("slice-1.tif");
+        let _ = std::fs::remove_file(&path);
+        std::os::unix::fs::symlink(target, path).unwrap();
+        refusal(&inside)
+    };
+    let there = link("../secret.tif");
+    assert_eq!(there.0, OpenErrorKind::Forbidden);
+    assert!(there.1.contains("`slice-1.tif` is a link that leads out of it"), "{}", there.1);
+    assert_eq!(link("../nothing.tif"), there);
+    assert_eq!(link("/dev/zero"), there);
+    assert_eq!(link("/nowhere/at/all"), there);
+    // A link inside, to nothing, to itself or to the folder, is no slice.
+    for target in ["nothing.tif", "slice-1.tif", "."] {
+        assert!(link(target).1.contains("holds no slices or pictures"), "{target}");
+    }
+}
+
+#[test]
+fn small_file_that_says_it_is_large_asks_before_it_is_inflated() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("honest.nrrd");
+    let header = "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 2048 2048 2048\nencoding: gzip\n\n";
+    // As many bytes as 8 GiB of zeros need; nobody looks at them before the size is allowed.
+    let data = vec![0u8; 9 << 20];
+    std::fs::write(&path, [header.as_bytes(), &data].concat()).unwrap();
+    let (kind, line) = refusal(&path);
+    assert_eq!(kind, OpenErrorKind::TooLarge, "{line}");
+    assert!(line.contains("9437184 bytes of file become 8589934592 bytes of samples"), "{line}");
+    assert!(line.contains("only 1073741824 are read unasked"), "{line}");
+    assert!(line.contains("give --max-bytes 8589934592 to read it all the same"), "{line}");
+    let asked = Hints { max_bytes: Some(8 << 30), ..Hints::default() };
+    let e = open_with(&path, &asked).expect_err("zeros are no gzip").problem;
+    assert_eq!(e.kind, OpenErrorKind::Damaged, "allowed, and then looked at: {e}");
+    let less = Hints { max_bytes: Some(23), ..Hints::default() };
+    std::fs::write(&path, [HEADER.as_bytes(), b"\n", &[7; 24]].concat()).unwrap();
+    let e = open_with(&path, &less).expect_err("24 bytes are more than 23").to_string();
+    assert!(e.contains("24 bytes of samples are more than the 23 allowed"), "{e}");
 }
 
 /// Returns the peak of resident memory in MiB; `None` where the system has no figure.

@@ -14,12 +14,12 @@ pub(crate) use elements::sniff;
 #[cfg(test)]
 pub(crate) use series::one_slice;
 
-use crate::Opened;
 use crate::error::{OpenErrorKind, Problem};
+use crate::limit::ByteCap;
 use crate::samples::{self, Endian, Layout, Supply};
+use crate::{Hints, Opened};
 use series::SeriesChoice;
 use slabcast_common::volume::{ValueMap, Volume};
-use std::ffi::OsString;
 use std::io::{BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -35,17 +35,18 @@ const CHILD_CPU_SECS: u64 = 120;
 /// Most bytes of samples per byte of a file: two bytes of RLE decode to at most 128.
 const RLE_RATIO: u64 = 64;
 
-/// Opens one series of these files, which are all DICOM and in `folder`. `series` names it, `file`
-/// is a slice of it, `reader` the command that parses.
+/// Opens one series of these files, which are all DICOM and in `folder`. The hints name it, the
+/// command that parses, and the limit; `file` is a slice of it.
 pub(crate) fn open(
     files: &[PathBuf],
     folder: &Path,
-    series: Option<&str>,
+    hints: &Hints,
     file: Option<&Path>,
-    reader: Option<&[OsString]>,
 ) -> Result<Opened, Problem> {
-    let bytes = files.iter().filter_map(|f| f.metadata().ok()).map(|m| m.len()).sum();
-    let Some(program) = reader else {
+    let series = hints.series.as_deref();
+    let stored = files.iter().filter_map(|f| f.metadata().ok()).map(|m| m.len()).sum();
+    let bytes = (stored, hints.cap());
+    let Some(program) = &hints.dicom_reader else {
         let (receiver, mut sender) = std::io::pipe().map_err(|e| Problem::io("pipe", &e))?;
         return std::thread::scope(|scope| {
             scope.spawn(move || {
@@ -58,7 +59,7 @@ pub(crate) fn open(
             read_series(receiver, bytes).unwrap_or_else(|| Err(reader_failed("it panicked")))
         });
     };
-    let [name, args @ ..] = program else { return Err(reader_failed("it has no name")) };
+    let [name, args @ ..] = &program[..] else { return Err(reader_failed("it has no name")) };
     let mut command = Command::new(name);
     command.args(args).arg(folder);
     if let Some(series) = series {
@@ -121,8 +122,9 @@ fn reader_failed(how: &str) -> Problem {
     )
 }
 
-/// Reads a series from the pipe, of files of `bytes` bytes together; `None` if nothing valid came.
-fn read_series(pipe: impl Read + Send, bytes: u64) -> Option<Result<Opened, Problem>> {
+/// Reads a series from the pipe, of files of so many bytes together and within a limit; `None` if
+/// nothing valid came.
+fn read_series(pipe: impl Read + Send, bytes: (u64, ByteCap)) -> Option<Result<Opened, Problem>> {
     let mut pipe = BufReader::with_capacity(128 << 10, pipe);
     let preface = match Preface::read(&mut pipe)? {
         Ok(preface) => preface,
@@ -135,14 +137,14 @@ fn read_series(pipe: impl Read + Send, bytes: u64) -> Option<Result<Opened, Prob
 fn read_volume(
     preface: Preface,
     pipe: &mut (dyn Read + Send),
-    bytes: u64,
+    (bytes, cap): (u64, ByteCap),
 ) -> Result<Opened, Problem> {
     let Preface { name, number, lattice, anatomical, rescale: [slope, intercept], notes, .. } =
         preface;
     let layout = Layout::new(lattice.dims.map(u64::from), number, Endian::Little, "slices")?;
     lattice.check().map_err(|e| Problem::malformed("slices", e, "get the series again"))?;
     let supply = Supply::Encoded { name: "DICOM", bytes, ratio: RLE_RATIO };
-    let (samples, stored) = samples::read(pipe, supply, &layout).map_err(|mut p| {
+    let (samples, stored) = samples::read(pipe, supply, &layout, cap).map_err(|mut p| {
         p.field = "slices".into();
         p
     })?;

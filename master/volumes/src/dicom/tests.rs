@@ -263,7 +263,7 @@ fn dicom_reader_process_failure_is_reported() {
     for (program, say) in
         [(&["false"][..], "exit status: 1"), (&["/no/such"], "could not be started")]
     {
-        let reader = program.iter().map(OsString::from).collect();
+        let reader = program.iter().map(std::ffi::OsString::from).collect();
         let hints = crate::Hints { dicom_reader: Some(reader), ..crate::Hints::default() };
         let e = crate::open_with(dir.path(), &hints).unwrap_err().to_string();
         assert!(e.contains(say) && e.contains("512 MiB"), "{e}");

@@ -7,7 +7,7 @@ fn read_all(
     endian: Endian,
 ) -> Result<(Samples, ValueMap), Problem> {
     let layout = Layout::new([n, 1, 1], number, endian, "sizes")?;
-    read(&mut &bytes[..], Supply::Plain { have: bytes.len() as u64 }, &layout)
+    read(&mut &bytes[..], Supply::Plain { have: bytes.len() as u64 }, &layout, ByteCap::default())
 }
 
 fn values((samples, map): &(Samples, ValueMap)) -> Vec<f64> {
@@ -31,7 +31,8 @@ fn panic_in_the_decompressing_thread_fails_the_file() {
     let need = 4 * THREAD_MIN_BYTES;
     let layout = Layout::new([1024, need / 1024, 1], Number::U8, Endian::Little, "sizes").unwrap();
     let supply = Supply::Encoded { name: "gzip", bytes: need, ratio: 64 };
-    let error = read(&mut Panics(need as usize / 2), supply, &layout).expect_err("it panics");
+    let error = read(&mut Panics(need as usize / 2), supply, &layout, ByteCap::default())
+        .expect_err("it panics");
     assert_eq!((error.kind, &error.field[..]), (OpenErrorKind::Unsupported, "data"));
     assert!(error.what.contains("panicked (injected into the decoder)"), "{error}");
 }

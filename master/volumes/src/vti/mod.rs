@@ -13,6 +13,7 @@ mod blocks;
 mod tags;
 
 use crate::error::{Problem, quoted};
+use crate::limit::ByteCap;
 use crate::samples::{self, Endian, Layout, Number, Supply};
 use crate::source::{Source, Stream};
 use crate::unpack::{Base64, Encoding};
@@ -34,7 +35,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// Reads a volume from the start of a source.
 pub(crate) fn read(source: Source, name: &str) -> Result<Volume, Problem> {
-    let len = source.len;
+    let (len, cap) = (source.len, source.cap);
     let mut tags = Tags::new(source.reader);
     let (mut file, mut image, mut section) = (None, None, None);
     // The array to draw, if its data are appended, and its offset in the appended data.
@@ -67,7 +68,7 @@ pub(crate) fn read(source: Source, name: &str) -> Result<Volume, Problem> {
                     _ => return Err(tag.bad("format", "ascii, binary or appended")),
                 };
                 let left = len.saturating_sub(tags.offset);
-                return finish(file, image, &array, (format, tags.reader, left), name);
+                return finish(file, image, &array, (format, tags.reader, left), (name, cap));
             }
             "AppendedData" => {
                 let Some((array, offset)) = &appended else { break };
@@ -90,7 +91,7 @@ pub(crate) fn read(source: Source, name: &str) -> Result<Volume, Problem> {
                 reader
                     .seek(SeekFrom::Current(*offset as i64))
                     .map_err(|e| Problem::io("AppendedData", &e))?;
-                return finish(file, image, array, (format, reader, left - offset), name);
+                return finish(file, image, array, (format, reader, left - offset), (name, cap));
             }
             _ => {}
         }
@@ -269,7 +270,7 @@ fn finish(
     image: &Image,
     array: &Array,
     (format, reader, left): (DataFormat, BufReader<Box<dyn Stream>>, u64),
-    name: &str,
+    (name, cap): (&str, ByteCap),
 ) -> Result<Volume, Problem> {
     let (dims, origin) = image.dims_and_origin(array.cells)?;
     let layout = Layout::new(dims, array.number, file.endian, "ImageData WholeExtent")?;
@@ -283,10 +284,11 @@ fn finish(
     lattice.check().map_err(|e| {
         Problem::malformed("ImageData Spacing", e, "correct the spacing or the axes")
     })?;
-    let (samples, map) = read_array(file, &layout, (format, reader, left)).map_err(|mut p| {
-        p.field = format!("DataArray {} {}", quoted(&array.name), p.field);
-        p
-    })?;
+    let (samples, map) =
+        read_array(file, &layout, (format, reader, left), cap).map_err(|mut p| {
+            p.field = format!("DataArray {} {}", quoted(&array.name), p.field);
+            p
+        })?;
     Ok(Volume::new(name, array.number.name(), false, lattice, samples, map))
 }
 
@@ -294,12 +296,18 @@ fn read_array(
     file: &File,
     layout: &Layout,
     (format, reader, left): (DataFormat, BufReader<Box<dyn Stream>>, u64),
+    cap: ByteCap,
 ) -> Result<(Samples, ValueMap), Problem> {
     if format == DataFormat::Text {
         let text = Box::new(blocks::UntilTag { inner: reader });
         let (mut reader, supply) =
             Encoding::Ascii.open(text, left, layout.number).map_err(|e| Problem::io("data", &e))?;
-        return samples::read(&mut *reader, supply, &Layout { endian: Endian::Little, ..*layout });
+        return samples::read(
+            &mut *reader,
+            supply,
+            &Layout { endian: Endian::Little, ..*layout },
+            cap,
+        );
     }
     let mut data = match format {
         DataFormat::Raw => Bytes::Raw(reader),
@@ -334,7 +342,7 @@ fn read_array(
             }
             _ => Supply::Encoded { name: "base64", bytes: left, ratio: 1 },
         };
-        return samples::read(&mut data.take(need), supply, layout);
+        return samples::read(&mut data.take(need), supply, layout, cap);
     }
     let [count, size, last] = [word(&mut data)?, word(&mut data)?, word(&mut data)?];
     let whole = if last == 0 { count } else { count.saturating_sub(1) };
@@ -358,7 +366,7 @@ fn read_array(
         return Err(samples::truncated(bytes, left));
     }
     let mut blocks = Blocks::new(Box::new(data), packed, size, last);
-    samples::read(&mut blocks, Supply::deflate("zlib", bytes), layout)
+    samples::read(&mut blocks, Supply::deflate("zlib", bytes), layout, cap)
 }
 
 /// Binary data, raw or in base64.

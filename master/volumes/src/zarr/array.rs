@@ -2,36 +2,46 @@
 
 use super::Placed;
 use super::codec::{Codecs, Shard};
-use super::json::Json;
+use super::json::{self, Json};
 use crate::error::{OpenErrorKind, Problem};
+use crate::limit::ByteCap;
 use crate::samples::{Endian, Number, reserve};
+use crate::source::{Folder, Inside, not_inside};
 use crate::wide;
 use rayon::prelude::*;
 use slabcast_common::volume::{Samples, ValueMap};
-use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::Path;
+use std::sync::Arc;
 
 /// Most bytes of a decoded chunk. Two (compressed and decoded) stay below the 64 MiB that reading
 /// may take beside the voxels.
 const CHUNK_MAX_BYTES: u64 = 32 << 20;
 /// Most bytes of chunks that all threads decode at once.
 const CONCURRENT_MAX_BYTES: u64 = 48 << 20;
+/// Most chunk files of a volume. Each is looked for, though none need be there: 3 us for one that
+/// is missing, so 3 s. A volume of 2^33 samples has a quarter as many in chunks of 32^3.
+const FILES_MAX: u64 = 1 << 20;
+/// Most inner chunks of a volume's shards: four for each file, since they cost no look-up.
+const INNER_MAX: u64 = 4 * FILES_MAX;
 /// Most axes of an array.
 const RANK_MAX: usize = 16;
 
-pub(super) fn is_array(folder: &Path) -> bool {
-    if folder.join(".zarray").is_file() {
+pub(super) fn is_array(root: &Folder, folder: &str) -> bool {
+    if root.has(&json::path(folder, ".zarray")) {
         return true;
     }
-    let meta = Json::read(&folder.join("zarr.json")).ok();
+    let meta = Json::read(root, folder, "zarr.json").ok();
     meta.and_then(|m| m.get("node_type")).is_some_and(|t| t.value == "array")
 }
 
 /// An array's metadata.
 pub(super) struct Array {
-    folder: PathBuf,
+    /// The opened folder, which no chunk's file is outside of.
+    root: Arc<Folder>,
+    /// The array's path in it.
+    folder: String,
     pub(super) shape: Vec<u64>,
     /// Shape of a chunk file, which holds one chunk or a shard.
     grid: Vec<u64>,
@@ -52,12 +62,13 @@ struct ChunkKey {
 }
 
 impl Array {
-    pub(super) fn open(folder: &Path) -> Result<Array, Problem> {
-        let v2 = folder.join(".zarray");
-        let array = if v2.is_file() {
-            Array::version_2(folder, &Json::read(&v2)?)?
+    /// Opens the array at a path of the opened folder.
+    pub(super) fn open(root: &Arc<Folder>, folder: &str) -> Result<Array, Problem> {
+        let read = |name| Json::read(root, folder, name);
+        let array = if root.has(&json::path(folder, ".zarray")) {
+            Array::version_2(root, folder, &read(".zarray")?)?
         } else {
-            Array::version_3(folder, &Json::read(&folder.join("zarr.json"))?)?
+            Array::version_3(root, folder, &read("zarr.json")?)?
         };
         let (rank, inner) = (array.shape.len(), array.inner());
         if rank == 0 || rank > RANK_MAX || array.grid.len() != rank || inner.len() != rank {
@@ -93,7 +104,7 @@ impl Array {
         self.shard.as_ref().map_or(&self.grid, |s| &s.inner)
     }
 
-    fn version_3(folder: &Path, meta: &Json) -> Result<Array, Problem> {
+    fn version_3(root: &Arc<Folder>, folder: &str, meta: &Json) -> Result<Array, Problem> {
         if meta.required("zarr_format")?.value != 3 || meta.required("node_type")?.value != "array"
         {
             return Err(meta.required("node_type")?.bad("an array of Zarr version 3"));
@@ -119,6 +130,7 @@ impl Array {
         let separator = separator(asked, usual)?;
         let (codecs, shard) = Codecs::version_3(&meta.required("codecs")?, &grid)?;
         Ok(Array {
+            root: root.clone(),
             folder: folder.into(),
             shape: meta.required("shape")?.sizes()?,
             grid,
@@ -131,7 +143,7 @@ impl Array {
         })
     }
 
-    fn version_2(folder: &Path, meta: &Json) -> Result<Array, Problem> {
+    fn version_2(root: &Arc<Folder>, folder: &str, meta: &Json) -> Result<Array, Problem> {
         let kind = meta.required("dtype")?;
         let bad = || kind.bad("an integer or float type such as |u1, <i2 or <f4");
         let text = kind.value.as_str().ok_or_else(bad)?;
@@ -152,6 +164,7 @@ impl Array {
         let grid = meta.required("chunks")?.sizes()?;
         let codecs = Codecs::version_2(meta, endian, grid.len())?;
         Ok(Array {
+            root: root.clone(),
             folder: folder.into(),
             shape: meta.required("shape")?.sizes()?,
             grid,
@@ -165,6 +178,63 @@ impl Array {
             codecs,
             shard: None,
         })
+    }
+
+    /// Checks the numbers of files and of inner chunks that reading has to look at.
+    pub(super) fn check_counts(&self, placed: &Placed) -> Result<(), Problem> {
+        let along = |step: &[u64]| {
+            placed.axes.iter().flatten().map(|&a| self.shape[a].div_ceil(step[a])).product::<u64>()
+        };
+        // All three sizes are at most 2^14.
+        let refused = |count: u64, most: u64, what: &str, remedy: &str| {
+            Err(Problem::new(
+                OpenErrorKind::TooLarge,
+                "chunk_shape",
+                format!("{count} {what} are more than {most}"),
+                remedy,
+            ))
+        };
+        let (files, inner) = (along(&self.grid), along(self.inner()));
+        if files > FILES_MAX {
+            let remedy = "write the array again with larger chunks, or in shards";
+            return refused(files, FILES_MAX, "chunk files", remedy);
+        }
+        if inner > INNER_MAX {
+            return refused(
+                inner,
+                INNER_MAX,
+                "inner chunks",
+                "write the array again with larger chunks",
+            );
+        }
+        Ok(())
+    }
+
+    /// Returns the bytes of the chunk files, or 0 where the limit does not depend on them. Counts
+    /// only until the limit is met.
+    pub(super) fn stored_bytes(&self, cap: ByteCap, placed: &Placed) -> u64 {
+        let enough = cap.stored_for(placed.bytes(self));
+        let mut stored = 0;
+        let mut cell = vec![0u64; self.shape.len()];
+        let count =
+            |axis: usize| placed.axes[axis].map_or(1, |a| self.shape[a].div_ceil(self.grid[a]));
+        let [nx, ny, nz] = [0, 1, 2].map(count);
+        let mut cells =
+            (0..nz).flat_map(|z| (0..ny).flat_map(move |y| (0..nx).map(move |x| [x, y, z])));
+        while stored < enough
+            && let Some(at) = cells.next()
+        {
+            for (axis, n) in placed.axes.iter().zip(at) {
+                if let Some(a) = axis {
+                    cell[*a] = n;
+                }
+            }
+            let path = json::path(&self.folder, &self.key.path(&cell));
+            if let Ok(Inside::File(_, len)) = self.root.find(Path::new(&path)) {
+                stored += len;
+            }
+        }
+        stored
     }
 
     /// Reads the samples along the axes of `placed`.
@@ -307,13 +377,14 @@ impl Array {
         out: &mut [T],
         code: &impl Fn(&[u8]) -> T,
     ) -> Result<(), Problem> {
-        let path = self.folder.join(self.key.path(cell));
+        let path = json::path(&self.folder, &self.key.path(cell));
         let io = |e: std::io::Error| Problem::io("file", &e);
-        let mut file = match std::fs::metadata(&path) {
+        let (mut file, len) = match self.root.find(Path::new(&path)).map_err(io)? {
+            Inside::File(file, len) => (file, len),
             // A chunk that was never written consists of the fill value.
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(()),
-            Err(e) => return Err(io(e)),
-            Ok(m) if !m.is_file() => {
+            Inside::Missing => return Ok(()),
+            Inside::Out => return Err(not_inside("its file", "file")),
+            Inside::Other => {
                 return Err(Problem::new(
                     OpenErrorKind::Forbidden,
                     "file",
@@ -321,9 +392,7 @@ impl Array {
                     "get the array again",
                 ));
             }
-            Ok(_) => File::open(&path).map_err(io)?,
         };
-        let len = file.metadata().map_err(io)?.len();
         let bytes = (self.inner().iter().product::<u64>() * self.number.bytes()) as usize;
         let first: Vec<u64> = cell.iter().zip(&self.grid).map(|(c, g)| c * g).collect();
         let Some(shard) = &self.shard else {

@@ -217,25 +217,33 @@ fn read_all(from: impl Read, most: usize) -> Result<Vec<u8>, Problem> {
     }
 }
 
-/// Decodes a zstd frame to at most `most` bytes. Checks the window size first, since a header of
-/// six bytes can demand that memory (RFC 8878, 3.1.1.1).
+/// Decodes a zstd frame to at most `most` bytes. Checks the window and the content size that its
+/// header declares first, since a header of six bytes can demand that memory (RFC 8878, 3.1.1.1).
 pub(super) fn zstd(data: &[u8], most: usize) -> Result<Vec<u8>, Problem> {
     let cut = || damaged("has no whole zstd header".into());
     if data.get(..4) != Some(&[0x28, 0xb5, 0x2f, 0xfd]) {
         return Err(damaged("does not begin as zstd".into()));
     }
     let descriptor = *data.get(4).ok_or_else(cut)?;
-    let window = if descriptor & 0x20 == 0 {
+    // A single segment has no window of its own: it is the content.
+    let single = descriptor & 0x20 != 0;
+    let start = 5 + usize::from(!single) + [0, 1, 2, 4][usize::from(descriptor & 3)];
+    let field = match descriptor >> 6 {
+        0 => usize::from(single),
+        flag => 1 << flag,
+    };
+    let bytes = data.get(start..start + field).ok_or_else(cut)?;
+    let content = bytes.iter().rev().fold(0u64, |n, b| n << 8 | u64::from(*b));
+    let content = content.saturating_add(if field == 2 { 256 } else { 0 });
+    if content > most as u64 {
+        return Err(damaged(format!("says that it becomes {content} bytes, more than {most}")));
+    }
+    let window = if single {
+        content
+    } else {
         let byte = *data.get(5).ok_or_else(cut)?;
         let base = 1u64 << (10 + (byte >> 3));
         base + base / 8 * u64::from(byte & 7)
-    } else {
-        // A single segment: the window is the content, whose size follows the dictionary id.
-        let start = 5 + [0, 1, 2, 4][usize::from(descriptor & 3)];
-        let field = [1, 2, 4, 8][usize::from(descriptor >> 6)];
-        let bytes = data.get(start..start + field).ok_or_else(cut)?;
-        let size = bytes.iter().rev().fold(0u64, |n, b| n << 8 | u64::from(*b));
-        size + if field == 2 { 256 } else { 0 }
     };
     // Encoders use windows of up to 8 MiB even for small contents.
     if window > (most as u64).max(SKIP_MAX_BYTES) {

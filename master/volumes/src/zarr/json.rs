@@ -2,10 +2,9 @@
 //! field.
 
 use crate::error::{Problem, quoted};
-use crate::source::{self, Source};
+use crate::source::Folder;
 use serde_json::Value;
 use std::io::Read;
-use std::path::{Path, PathBuf};
 
 /// Largest metadata file; those of real pictures have some KiB.
 const METADATA_MAX_BYTES: u64 = 1 << 20;
@@ -18,9 +17,10 @@ pub(super) struct Json {
 }
 
 impl Json {
-    pub(super) fn read(path: &Path) -> Result<Json, Problem> {
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let source = Source::open(path, &name)?;
+    /// Reads a file of a folder of the opened one, each called by its path.
+    pub(super) fn read(root: &Folder, folder: &str, name: &str) -> Result<Json, Problem> {
+        let source = root.named(&path(folder, name), name)?;
+        let name = name.to_string();
         let mut text = Vec::new();
         let read = source.reader.take(METADATA_MAX_BYTES + 1).read_to_end(&mut text);
         read.map_err(|e| Problem::io(&name, &e))?;
@@ -92,7 +92,7 @@ impl Json {
     }
 }
 
-/// Returns the folder, below `folder`, that metadata name.
-pub(super) fn path_in(folder: &Path, name: &str) -> Result<PathBuf, Problem> {
-    source::resolve_in_folder(folder, name, "datasets path")
+/// Returns the path of what is called `name` in `folder`, both from the opened folder.
+pub(super) fn path(folder: &str, name: &str) -> String {
+    if folder.is_empty() { name.into() } else { format!("{folder}/{name}") }
 }

@@ -14,43 +14,41 @@ mod codec;
 mod json;
 
 use crate::error::{OpenErrorKind, Problem, quoted};
+use crate::limit::{ByteCap, free_memory};
+use crate::source::Folder;
 use crate::{Hints, Opened};
 use array::Array;
-use json::{Json, path_in};
+use json::{Json, path};
 use serde_json::Value;
 use slabcast_common::volume::{Lattice, Volume};
 use std::path::Path;
+use std::sync::Arc;
 
 /// Returns whether a folder is a Zarr array or group.
 pub(crate) fn is_node(folder: &Path) -> bool {
-    ["zarr.json", ".zarray", ".zgroup", ".zattrs"].iter().any(|f| folder.join(f).is_file())
+    Folder::open(folder, "folder").is_ok_and(|root| has_node(&root, ""))
+}
+
+fn has_node(root: &Folder, folder: &str) -> bool {
+    ["zarr.json", ".zarray", ".zgroup", ".zattrs"].iter().any(|f| root.has(&path(folder, f)))
 }
 
 /// Opens a folder that is an array or a pyramid.
 pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let mut notes = Vec::new();
-    if array::is_array(folder) {
-        let array = Array::open(folder)?;
+    let root = Arc::new(Folder::open(folder, "folder")?);
+    if array::is_array(&root, "") {
+        let array = Array::open(&root, "")?;
         let placed = Placed::without_metadata(&array)?;
-        // Missing chunks are filled, so the size of the files does not bound the samples.
-        let budget = hints.max_bytes.unwrap_or_else(|| free_memory() / 4 * 3);
-        if placed.bytes(&array) > budget {
-            return Err(Problem::new(
-                OpenErrorKind::TooLarge,
-                "shape",
-                format!("{:?} takes more than {} MiB", array.shape, budget >> 20),
-                "give more with --max-bytes, or use a machine with more memory",
-            ));
-        }
-        return read(array, placed, &name, notes);
+        return read(array, placed, &name, notes, hints.cap());
     }
-    let mut group = folder.to_path_buf();
-    let mut scales = multiscales(&group)?;
+    let mut group = "";
+    let mut scales = multiscales(&root, group)?;
     // bioformats2raw writes each picture into a numbered group of its own.
-    if scales.is_none() && is_node(&folder.join("0")) && !array::is_array(&folder.join("0")) {
-        group = folder.join("0");
-        scales = multiscales(&group)?;
+    if scales.is_none() && has_node(&root, "0") && !array::is_array(&root, "0") {
+        group = "0";
+        scales = multiscales(&root, group)?;
         notes.push("the first picture (0) of several was read".into());
     }
     let Some(scales) = scales else {
@@ -69,7 +67,7 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let count = levels.len();
     let open = |level: usize| -> Result<(Array, Placed), Problem> {
         let dataset = levels.entry(level);
-        let array = Array::open(&path_in(&group, dataset.required("path")?.text()?)?)?;
+        let array = Array::open(&root, &path(group, dataset.required("path")?.text()?))?;
         let placed = axes.place(&array, &image, &dataset)?;
         Ok((array, placed))
     };
@@ -117,19 +115,7 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
             count - 1
         ));
     }
-    read(array, placed, &name, notes)
-}
-
-/// Free memory to assume where the system does not tell.
-const FREE_MEMORY_BYTES: u64 = 4 << 30;
-
-/// Returns the free memory in bytes. A level of a pyramid may take a quarter of it, since bricks,
-/// encoded bricks and frames need memory too.
-fn free_memory() -> u64 {
-    let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
-    let line = text.lines().find(|l| l.starts_with("MemAvailable:"));
-    let kib = line.and_then(|l| l.split_ascii_whitespace().nth(1)?.parse::<u64>().ok());
-    kib.map_or(FREE_MEMORY_BYTES, |kib| kib * 1024)
+    read(array, placed, &name, notes, hints.cap())
 }
 
 fn read(
@@ -137,11 +123,15 @@ fn read(
     placed: Placed,
     name: &str,
     mut notes: Vec<String>,
+    cap: ByteCap,
 ) -> Result<Opened, Problem> {
     let lattice = Lattice {
         origin: glam::DVec3::from_array(placed.origin),
         ..Lattice::from_spacing(placed.dims.map(|n| n as u32), placed.spacing)
     };
+    array.check_counts(&placed)?;
+    // Missing chunks are filled, so no byte need be there for a sample.
+    cap.check(placed.bytes(&array), array.stored_bytes(cap, &placed), "shape")?;
     notes.extend(placed.notes.iter().cloned());
     let (samples, map) = array.read(&placed)?;
     lattice
@@ -153,19 +143,17 @@ fn read(
 }
 
 /// Returns the `multiscales` list of a group; `None` if it has none.
-fn multiscales(group: &Path) -> Result<Option<Json>, Problem> {
-    let v3 = group.join("zarr.json");
-    if v3.is_file() {
-        let meta = Json::read(&v3)?;
+fn multiscales(root: &Folder, group: &str) -> Result<Option<Json>, Problem> {
+    if root.has(&path(group, "zarr.json")) {
+        let meta = Json::read(root, group, "zarr.json")?;
         let attributes = meta.get("attributes");
         let ome = attributes.as_ref().and_then(|a| a.get("ome"));
         return Ok(ome
             .and_then(|o| o.get("multiscales"))
             .or_else(|| attributes?.get("multiscales")));
     }
-    let v2 = group.join(".zattrs");
-    if v2.is_file() {
-        return Ok(Json::read(&v2)?.get("multiscales"));
+    if root.has(&path(group, ".zattrs")) {
+        return Ok(Json::read(root, group, ".zattrs")?.get("multiscales"));
     }
     Ok(None)
 }

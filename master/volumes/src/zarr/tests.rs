@@ -247,7 +247,7 @@ fn zarr_errors_name_field_and_remedy() {
         ("rank", "shape: has 3 axes and chunks of 2"),
         ("json", ".zarray: is no JSON"),
         ("cut", "chunk 0/0/0 data: has 24 bytes of samples, not 48"),
-        ("out", "datasets path: `../type` lies outside"),
+        ("out", "`../type/.zarray` is not there, or leads out of the folder"),
         ("axes", "has no x and y"),
         ("group", "is no OME-Zarr picture"),
         ("shard", "chunk c/0/0/0 data: has 5 bytes, less than its index"),
@@ -255,4 +255,162 @@ fn zarr_errors_name_field_and_remedy() {
         let e = crate::open(&at(name)).unwrap_err().to_string();
         assert!(e.contains(say), "{name}: want {say:?} in {e}");
     }
+}
+
+/// An array of one zstd chunk of 64^3 bytes in the folder, and its chunk.
+fn one_zstd_chunk(folder: &Path, chunk: &[u8]) {
+    let meta = json!({
+        "zarr_format": 2, "shape": [64, 64, 64], "chunks": [64, 64, 64], "dtype": "|u1",
+        "compressor": {"id": "zstd", "level": 1}, "fill_value": 0, "filters": null, "order": "C",
+    });
+    put(folder, ".zarray", meta.to_string().as_bytes());
+    put(folder, "0.0.0", chunk);
+}
+
+/// A zstd frame whose second block repeats one match of 131,074 bytes `n` times (RUSTSEC-2026-0344:
+/// ruzstd up to 0.9.0 let such a block grow to gigabytes, and panicked beyond 8).
+fn growing_block(n: u16) -> Vec<u8> {
+    let mut body = b"\x08A\xff".to_vec();
+    body.extend((n - 0x7f00).to_le_bytes());
+    body.extend(b"\x54\x00\x00\x34");
+    body.extend([0xff, 0xff].repeat(n.into()));
+    body.push(1);
+    let block = |kind: u32, bytes: &[u8]| {
+        let head = ((bytes.len() as u32) << 3 | kind).to_le_bytes();
+        [&head[..3], bytes].concat()
+    };
+    [b"\x28\xb5\x2f\xfd\x00\x38", &block(0, b"ABCDEFGH")[..], &block(2 << 1 | 1, &body)].concat()
+}
+
+#[test]
+fn zstd_chunk_that_grows_past_its_size_is_refused_small() {
+    let dir = tempfile::tempdir().unwrap();
+    for n in [0x7f00, 48_000, 65_000] {
+        let chunk = growing_block(n);
+        assert!(chunk.len() < 131_072);
+        one_zstd_chunk(dir.path(), &chunk);
+        let _ = std::fs::write("/proc/self/clear_refs", "5");
+        let before = crate::fuzz::resident_kib("VmHWM:");
+        let e = crate::open(dir.path()).unwrap_err().to_string();
+        assert!(e.contains("chunk 0.0.0 data: "), "{e}");
+        let grew = crate::fuzz::resident_kib("VmHWM:").saturating_sub(before) >> 10;
+        // Other tests run beside this one; 4.1 GiB is what it was.
+        assert!(grew < 256, "{n}: grew by {grew} MiB");
+    }
+}
+
+#[test]
+fn zstd_header_that_declares_more_than_a_chunk_is_refused_unread() {
+    let dir = tempfile::tempdir().unwrap();
+    let packed = compress_to_vec(&[7u8; 1 << 18][..], CompressionLevel::Fastest);
+    let magic = b"\x28\xb5\x2f\xfd";
+    // A window byte and eight bytes of content size; a single segment of four.
+    for (head, say) in [
+        (&b"\xc0\x38\xff\xff\xff\xff\xff\xff\xff\xff"[..], "becomes 18446744073709551615 bytes"),
+        (b"\xa0\x01\x00\x04\x00", "becomes 262145 bytes, more than 262144"),
+        (b"\x00\xf8", "asks for a window of"),
+        (b"\xa0\x01", "no whole zstd header"),
+    ] {
+        one_zstd_chunk(dir.path(), &[&magic[..], head].concat());
+        let e = crate::open(dir.path()).unwrap_err().to_string();
+        assert!(e.contains(say), "want {say:?} in {e}");
+    }
+    one_zstd_chunk(dir.path(), &packed);
+    assert_eq!(crate::open(dir.path()).unwrap().samples, Samples::U8(vec![7; 1 << 18]));
+}
+
+#[test]
+fn zarr_of_billions_of_chunks_or_bytes_is_refused_before_it_is_looked_at() {
+    let dir = tempfile::tempdir().unwrap();
+    let meta = |shape: [u64; 3], chunks: [u64; 3]| {
+        let meta = json!({
+            "zarr_format": 2, "shape": shape, "chunks": chunks, "dtype": "|u1",
+            "compressor": null, "fill_value": 0, "filters": null, "order": "C",
+        });
+        put(dir.path(), ".zarray", meta.to_string().as_bytes());
+        let start = std::time::Instant::now();
+        let result = crate::open(dir.path()).map(|v| v.lattice.dims).map_err(|e| e.to_string());
+        assert!(start.elapsed().as_secs() < 5, "{shape:?} took {:?}", start.elapsed());
+        result
+    };
+    let e = meta([1000, 2000, 2000], [1, 1, 1]).unwrap_err();
+    assert!(e.contains("chunk_shape: 4000000000 chunk files are more than 1048576"), "{e}");
+    let e = meta([2000, 2000, 2000], [100, 100, 100]).unwrap_err();
+    assert!(e.contains("shape: 0 bytes of file become 8000000000 bytes"), "{e}");
+    assert!(e.contains("--max-bytes 8000000000"), "{e}");
+    // Pages that hold nothing but the fill value are not counted against small arrays.
+    assert_eq!(meta([64, 64, 64], [8, 8, 8]), Ok([64; 3]));
+}
+
+#[test]
+fn zarr_of_millions_of_inner_chunks_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    sharded(dir.path());
+    let text = std::fs::read_to_string(dir.path().join("zarr.json")).unwrap();
+    let mut meta: serde_json::Value = serde_json::from_str(&text).unwrap();
+    meta["shape"] = json!([256, 256, 512]);
+    meta["chunk_grid"]["configuration"]["chunk_shape"] = json!([256, 256, 512]);
+    meta["codecs"][0]["configuration"]["chunk_shape"] = json!([1, 1, 1]);
+    put(dir.path(), "zarr.json", meta.to_string().as_bytes());
+    let e = crate::open(dir.path()).unwrap_err().to_string();
+    assert!(e.contains("chunk_shape: 33554432 inner chunks are more than 4194304"), "{e}");
+}
+
+#[cfg(unix)]
+#[test]
+fn zarr_links_out_of_the_folder_are_refused_whatever_they_lead_to() {
+    use std::os::unix::fs::symlink;
+    let dir = tempfile::tempdir().unwrap();
+    let outside = dir.path().join("outside");
+    version_2(&outside, "none", false, false);
+    // Each with its target, which exists in the first case and does not in the second.
+    for exists in [true, false] {
+        let target = |name: &str| match exists {
+            true => outside.join(name),
+            false => outside.join("nothing").join(name),
+        };
+        let case = |name: &str| {
+            let folder = dir.path().join(format!("{exists}-{name}"));
+            version_2(&folder, "none", false, false);
+            folder
+        };
+        let refused = |folder: &Path, field: &str| {
+            let e = crate::open(folder).unwrap_err();
+            let (kind, line) = (e.problem.kind, e.to_string());
+            assert_eq!(kind, OpenErrorKind::Forbidden, "{line}");
+            let say = format!("{field} is not there, or leads out of the folder");
+            assert!(line.contains(&say), "want {say:?} in {line}");
+        };
+        let again = |path: &Path, target: &Path| {
+            let _ = std::fs::remove_file(path);
+            let _ = std::fs::remove_dir_all(path);
+            symlink(target, path).unwrap();
+        };
+        let folder = case("chunk");
+        again(&folder.join("0/1/0"), &target("0/1/0"));
+        refused(&folder, "chunk 0/1/0 file: its file");
+        again(&folder.join("0/1/0"), Path::new("../../../outside/0/1/0"));
+        refused(&folder, "chunk 0/1/0 file: its file");
+        let folder = case("folder-of-chunks");
+        again(&folder.join("1"), &target("1"));
+        refused(&folder, "chunk 1/0/0 file: its file");
+        let folder = case("metadata");
+        again(&folder.join(".zarray"), &target(".zarray"));
+        refused(&folder, ".zarray: `.zarray`");
+        let folder = dir.path().join(format!("{exists}-level"));
+        pyramid(&folder);
+        again(&folder.join("0"), &target(""));
+        let e = crate::open(&folder).unwrap_err().to_string();
+        assert!(e.contains("is not there, or leads out of the folder"), "{e}");
+    }
+    // Links inside are followed, also of a whole path.
+    let folder = dir.path().join("links-inside");
+    version_2(&folder, "none", false, false);
+    let (from, to) = (folder.join("0/1/0"), folder.join("kept"));
+    std::fs::rename(&from, &to).unwrap();
+    symlink("../../kept", &from).unwrap();
+    assert_eq!(values(&crate::open(&folder).unwrap()), (0..60).collect::<Vec<i16>>());
+    std::fs::remove_file(&from).unwrap();
+    symlink(&to, &from).unwrap();
+    assert_eq!(values(&crate::open(&folder).unwrap()), (0..60).collect::<Vec<i16>>());
 }

@@ -74,7 +74,10 @@ fn detached_data_outside_the_header_folder_are_refused() {
         point_at(name).unwrap();
         let (kind, line) = refusal(&header);
         assert_eq!(kind, OpenErrorKind::Forbidden, "{line}");
-        assert!(line.contains("data file") && line.contains("put the data file beside its header"), "{line}");
+        assert!(
+            line.contains("data file") && line.contains("put the data file beside its header"),
+            "{line}"
+        );
     }
     for name in ["/etc/passwd", "/dev/zero", "nothing.raw", "below", "."] {
         point_at(name).unwrap();

@@ -1,13 +1,15 @@
 //! Reader of DICOM series: a folder of slices, sorted by position, becomes one volume.
 //!
-//! Files are not trusted, so a process of its own parses them ([`serve`]). It may take 512 MiB and
-//! 120 s of processor time, may write no file, and sends the series and its samples through a pipe.
-//! The caller names the program ([`crate::Hints::dicom_reader`]); without one a thread parses them,
-//! unconfined.
+//! Files are not trusted, so a process of its own parses them ([`serve`]). It confines itself to
+//! reading their folder (`confine`), is killed when it takes too long (`watch`), and sends the series
+//! and its samples through a pipe. The caller names the program
+//! ([`crate::Hints::dicom_reader`]); without one a thread parses them, unconfined.
 
+mod confine;
 mod elements;
 mod rle;
 mod series;
+mod watch;
 mod wire;
 
 pub(crate) use elements::sniff;
@@ -18,19 +20,19 @@ use crate::error::{OpenErrorKind, Problem};
 use crate::limit::ByteCap;
 use crate::samples::{self, Endian, Layout, Supply};
 use crate::{Hints, Opened};
+use confine::{CPU_SECS, MEMORY_BYTES};
 use series::SeriesChoice;
 use slabcast_common::volume::{ValueMap, Volume};
 use std::io::{BufReader, Read, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+use watch::Watched;
 use wire::Preface;
 
-/// Memory limit of the parsing process. A slice of 16384 x 16384 pixels of 16 bits (512 MiB) is
-/// refused; one of 8192 x 8192 passes, compressed or not.
-const CHILD_MEMORY_BYTES: u64 = 512 << 20;
-
-/// Processor time limit of the parsing process: 16384 slices of 512 x 512 take some 10 s.
-const CHILD_CPU_SECS: u64 = 120;
+/// Bytes of files that the parsing process must get through in a second, by the wall clock: slow for
+/// a network disk, and more than a process that only waits.
+const BYTES_A_SECOND: u64 = 4 << 20;
 
 /// Most bytes of samples per byte of a file: two bytes of RLE decode to at most 128.
 const RLE_RATIO: u64 = 64;
@@ -53,7 +55,8 @@ pub(crate) fn open(
                 // The receiver reports a panic, since the pipe then ends before the series.
                 let _ = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
                     // A receiver that is gone has failed on its own.
-                    let _ = write_series(files, &SeriesChoice { series, file }, &mut sender);
+                    let choice = SeriesChoice { series, file };
+                    let _ = write_series(files, &choice, Vec::new(), &mut sender);
                 }));
             });
             read_series(receiver, bytes).unwrap_or_else(|| Err(reader_failed("it panicked")))
@@ -68,15 +71,10 @@ pub(crate) fn open(
     if let Some(file) = file {
         command.arg("--file").arg(file);
     }
-    let child = command
-        .stdin(Stdio::null())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
+    command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let (mut child, stdout, stderr) = Watched::start(&mut command, wall_limit(stored))
         .map_err(|e| reader_failed(&format!("it could not be started: {e}")))?;
-    let mut child = KillOnDrop(child);
-    let Some(receiver) = child.0.stdout.take() else { return Err(reader_failed("it has no pipe")) };
-    let result = match read_series(receiver, bytes) {
+    let result = match read_series(stdout, bytes) {
         // Samples that end early, or nothing at all: the exit status says more.
         Some(Err(problem)) if problem.kind == OpenErrorKind::Damaged => Some(problem),
         Some(result) => return result,
@@ -84,29 +82,24 @@ pub(crate) fn open(
     };
     // The process has ended, or ends now that the pipe is closed.
     let mut message = String::new();
-    if let Some(stderr) = child.0.stderr.take() {
-        let _ = stderr.take(STDERR_MAX_BYTES).read_to_string(&mut message);
-    }
-    match (result, child.0.wait()) {
+    let _ = stderr.take(STDERR_MAX_BYTES).read_to_string(&mut message);
+    match (result, child.end()) {
         (Some(problem), Ok(status)) if status.success() => Err(problem),
+        (_, Ok(_)) if child.is_late() => {
+            Err(reader_failed(&format!("it took more than {} s", wall_limit(stored).as_secs())))
+        }
         (_, Ok(status)) => Err(reader_failed(&format!("{status} {}", message.trim()))),
         (_, Err(e)) => Err(reader_failed(&e.to_string())),
     }
 }
 
+/// Returns how long files of `bytes` bytes may take, by the wall clock.
+fn wall_limit(bytes: u64) -> Duration {
+    Duration::from_secs(CPU_SECS + bytes / BYTES_A_SECOND)
+}
+
 /// Most bytes taken of the parsing process's error message.
 const STDERR_MAX_BYTES: u64 = 300;
-
-/// A child process that is killed and reaped when dropped.
-struct KillOnDrop(Child);
-
-impl Drop for KillOnDrop {
-    fn drop(&mut self) {
-        // Both fail only if it has ended already.
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
 
 /// Returns the error for a parsing process that failed; `how` it ended.
 fn reader_failed(how: &str) -> Problem {
@@ -114,9 +107,9 @@ fn reader_failed(how: &str) -> Problem {
         OpenErrorKind::TooLarge,
         "DICOM",
         format!(
-            "the process that parses it, with {} MiB and {CHILD_CPU_SECS} s at most, ended \
-             before it was done ({how})",
-            CHILD_MEMORY_BYTES >> 20
+            "the process that parses it, with {} MiB and {CPU_SECS} s at most, ended before it was \
+             done ({how})",
+            MEMORY_BYTES >> 20
         ),
         "convert the series, for instance with dcm2niix",
     )
@@ -165,11 +158,12 @@ fn read_volume(
 fn write_series(
     files: &[PathBuf],
     choice: &SeriesChoice<'_>,
+    notes: Vec<String>,
     out: &mut dyn Write,
 ) -> std::io::Result<()> {
     // After the first byte a problem can't be written any more; the reader sees an early end.
     let mut out = WriteTracker { out, started: false };
-    match series::write(files, choice, &mut out) {
+    match series::write(files, choice, notes, &mut out) {
         Err(problem) if !out.started => wire::write_problem(&problem, out.out),
         Err(problem) => Err(std::io::Error::other(problem)),
         Ok(()) => Ok(()),
@@ -197,8 +191,9 @@ impl Write for WriteTracker<'_> {
 /// and writes one series, or the problem that prevents it, to `out`.
 ///
 /// `series` names the series (its number, description, name or UID); `file` is a slice whose series
-/// is meant. First the process limits itself for good, where the system allows it: 512 MiB of
-/// memory, 120 s of processor time, no file written.
+/// is meant. First the process confines itself for good, where the system allows it: 512 MiB of
+/// memory, 120 s of processor time, the files of the folder to read, nothing to write but `out`, no
+/// network and no other process. What the system did not allow goes with the series as a note.
 ///
 /// # Errors
 /// Reading fails after the first samples were written, or `out` can't be written. The process must
@@ -209,30 +204,12 @@ pub fn serve(
     file: Option<&Path>,
     out: &mut dyn Write,
 ) -> std::io::Result<()> {
-    confine();
+    let notes = confine::confine(folder);
     match crate::folder::dicom_files(folder) {
-        Ok(files) => write_series(&files, &SeriesChoice { series, file }, out),
+        Ok(files) => write_series(&files, &SeriesChoice { series, file }, notes, out),
         Err(problem) => wire::write_problem(&problem, out),
     }
 }
-
-/// Limits memory and processor time of this process, and forbids it to write files. Where the
-/// system refuses, only the parser's own limits apply.
-#[cfg(unix)]
-fn confine() {
-    use rustix::process::{Resource, Rlimit, setrlimit};
-    for (resource, most) in [
-        (Resource::As, CHILD_MEMORY_BYTES),
-        (Resource::Cpu, CHILD_CPU_SECS),
-        (Resource::Fsize, 0),
-        (Resource::Core, 0),
-    ] {
-        let _ = setrlimit(resource, Rlimit { current: Some(most), maximum: Some(most) });
-    }
-}
-
-#[cfg(not(unix))]
-fn confine() {}
 
 #[cfg(test)]
 pub(crate) mod tests;

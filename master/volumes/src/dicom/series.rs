@@ -70,10 +70,12 @@ pub(crate) struct SeriesChoice<'a> {
     pub(crate) file: Option<&'a Path>,
 }
 
-/// Writes the chosen series of these files: a preface, then samples in little-endian order.
+/// Writes the chosen series of these files: a preface with these notes and more, then samples in
+/// little-endian order.
 pub(super) fn write(
     files: &[PathBuf],
     choice: &SeriesChoice<'_>,
+    mut notes: Vec<String>,
     out: &mut dyn Write,
 ) -> Result<(), Problem> {
     let (all, left_out, unread) = gather(files)?;
@@ -83,7 +85,6 @@ pub(super) fn write(
     }
     let mut series = choose(all, choice)?;
     let name = series.name();
-    let mut notes = Vec::new();
     if total > 1 {
         notes.push(format!("series {} of {total} was read", quoted(&name)));
     }

@@ -5,7 +5,7 @@ use crate::{ANSWER, Client, ClientError, JobNotice, JobState};
 use slabcast_common::image::PixelFormat;
 use slabcast_common::stats::FrameStats;
 use slabcast_proto::convert::{self, StatisticsParts};
-use slabcast_proto::model::{FrameChunk, WatchMessage};
+use slabcast_proto::model::{FrameChunk, FrameFailure, WatchMessage};
 use slabcast_proto::render_v1 as wire;
 use std::time::Duration;
 use tokio::time::Instant;
@@ -48,6 +48,13 @@ pub enum Update {
     Notice(JobNotice),
     /// A whole frame.
     Frame(Box<ReceivedFrame>),
+    /// A frame that could not be drawn. Frames after it come all the same.
+    FrameFailed {
+        /// Number of the frame in its job, from 0.
+        number: u64,
+        /// Why, for people; one line.
+        reason: String,
+    },
 }
 
 /// A whole frame as a client received it: pixels and statistics.
@@ -142,13 +149,14 @@ impl FrameStream {
         self.next
     }
 
-    /// Returns the next notice or whole frame; `None` after the last frame of a job that is done.
+    /// Returns the next notice, whole frame or failure of a frame; `None` after the last frame of a
+    /// job that is done.
     ///
     /// May be dropped before it is ready (in a `select!`) without losing anything.
     ///
     /// # Errors
     /// [`ClientError::JobFailed`] and [`ClientError::JobCancelled`] after the last frame of such a
-    /// job; [`ClientError::Lost`] or [`ClientError::GaveUp`] if the connection breaks, by
+    /// job, also where some of its frames failed and all others came; [`ClientError::Lost`] or [`ClientError::GaveUp`] if the connection breaks, by
     /// [`Client::watch`] or [`Client::follow`]; [`ClientError::FrameNotKept`] if the master no
     /// longer keeps the next frame; [`ClientError::Protocol`] if the chunks of a frame do not fit
     /// together.
@@ -204,6 +212,16 @@ impl FrameStream {
                 self.latest = Some(notice.clone());
                 Ok(Some(Update::Notice(notice)))
             }
+            WatchMessage::Failed(FrameFailure { frame, reason }) => {
+                if frame != self.next || self.partial.is_some() {
+                    let problem = format!("frame {frame} failed instead of {}", self.next);
+                    return Err(self.client.protocol_error(&problem));
+                }
+                self.next += 1;
+                self.outage = None;
+                let reason = one_line(&reason);
+                Ok(Some(Update::FrameFailed { number: frame, reason }))
+            }
             WatchMessage::Chunk(chunk) => {
                 let frame =
                     self.add(chunk).map_err(|problem| self.client.protocol_error(&problem))?;
@@ -243,6 +261,8 @@ impl FrameStream {
         self.partial.is_none()
             && self.latest.as_ref().is_some_and(|notice| match notice.state {
                 JobState::Done => self.next >= notice.frames_total,
+                // All frames came to an end, and some failed.
+                JobState::Failed if notice.frames_failed > 0 => self.next >= notice.frames_total,
                 state => state.is_final(),
             })
     }

@@ -16,6 +16,7 @@
 //!     match update {
 //!         Update::Notice(notice) => eprintln!("{}: {}", notice.state, notice.message),
 //!         Update::Frame(frame) => println!("frame {}: {} bytes", frame.number, frame.bytes.len()),
+//!         Update::FrameFailed { number, reason } => eprintln!("frame {number}: {reason}"),
 //!     }
 //! }
 //! # Ok(()) }
@@ -121,7 +122,8 @@ impl Client {
     }
 
     /// Submits a path and returns the job's id. Calling again with the same `client_key` and
-    /// the same request gives the same job.
+    /// the same request gives the same job; if it is over and frames of it failed, these are drawn
+    /// again.
     ///
     /// # Errors
     /// [`ClientError::InvalidField`] if a field is wrong, [`ClientError::TooLong`] if the request

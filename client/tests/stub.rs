@@ -128,6 +128,7 @@ fn job(id: &str, state: JobState) -> Job {
         state,
         message: String::new(),
         frames_done: 0,
+        frames_failed: 0,
         frames_total: 1,
         size: [4, 4],
         format: PixelFormat::Rgb8,
@@ -145,6 +146,7 @@ fn notice(
     Ok(convert::notice_to_wire(&JobNotice {
         state,
         frames_done: 0,
+        frames_failed: 0,
         frames_total,
         render_threads: 1,
         message,
@@ -236,7 +238,7 @@ async fn frame(frames: &mut FrameStream) -> ReceivedFrame {
     loop {
         match frames.next().await.unwrap() {
             Some(Update::Frame(frame)) => return *frame,
-            Some(Update::Notice(_)) => {}
+            Some(Update::Notice(_) | Update::FrameFailed { .. }) => {}
             None => panic!("the job ended"),
         }
     }
@@ -275,6 +277,7 @@ async fn frame_in_many_chunks_is_assembled_with_its_statistics() {
         match frames.next().await.unwrap().unwrap() {
             Update::Notice(notice) => notices.push(notice.state),
             Update::Frame(frame) => break frame,
+            Update::FrameFailed { .. } => panic!("no frame failed"),
         }
     };
     assert_eq!(notices, [JobState::Running, JobState::WaitingForWorkers], "also within a frame");
@@ -404,6 +407,32 @@ async fn failed_or_cancelled_job_ends_its_stream_with_an_error() {
     let mut frames = client.watch("job-0", 1).await.unwrap();
     assert!(matches!(frames.next().await, Ok(Some(Update::Notice(_)))));
     assert!(matches!(frames.next().await, Err(ClientError::JobCancelled { .. })));
+}
+
+#[tokio::test]
+async fn frame_that_failed_is_told_in_its_place_and_the_others_come() {
+    let script = Script::default();
+    let mut all = vec![notice(JobState::Running, 3, "")];
+    all.extend(chunks(0, [3, 3], ""));
+    all.push(Ok(convert::frame_failed_to_wire(1, "a refused it:\nout of memory")));
+    all.extend(chunks(2, [3, 3], ""));
+    all.push(notice(JobState::Failed, 3, "1 of 3 frames failed"));
+    *script.watches.lock().unwrap() = HashMap::from([(0, (all, true))]);
+    let client = Client::connect(&serve(&script).await.to_string()).await.unwrap();
+    let mut frames = client.watch("job-0", 0).await.unwrap();
+    let mut told = Vec::new();
+    let end = loop {
+        match frames.next().await {
+            Ok(Some(Update::Frame(frame))) => told.push((frame.number, String::new())),
+            Ok(Some(Update::FrameFailed { number, reason })) => told.push((number, reason)),
+            Ok(Some(Update::Notice(_))) => {}
+            end => break end,
+        }
+    };
+    let reason = "a refused it: out of memory";
+    assert_eq!(told, [(0, String::new()), (1, reason.into()), (2, String::new())]);
+    assert!(matches!(end, Err(ClientError::JobFailed { .. })), "{end:?}");
+    assert_eq!(frames.next_frame(), 3);
 }
 
 #[tokio::test]

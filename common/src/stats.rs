@@ -233,7 +233,8 @@ pub struct FrameStats {
     /// Number of results that came too late or twice and were dropped.
     #[serde(default)]
     pub dropped_results: u64,
-    /// Tiles given up after three workers were lost with them.
+    /// Tiles that are missing. Masters of today leave it empty: a frame of which a tile can't be
+    /// drawn fails.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub poisoned: Vec<PoisonedTile>,
     /// Reason for the frame's length, one sentence for people.
@@ -244,7 +245,7 @@ pub struct FrameStats {
     pub rehearsed: bool,
 }
 
-/// A macrotile that took three workers with it. Its pixels stay as the slabs in front left them.
+/// A macrotile that no worker could draw.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PoisonedTile {
     /// Number of the slab, front to back, from 0.

@@ -9,7 +9,7 @@ use slabcast_common::message::{Hello, ToMaster, ToWorker};
 use slabcast_common::protocol::{MAX_THREADS, PROTOCOL_VERSIONS, ProtocolVersions};
 use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
 use slabcast_proto::model::Worker;
-use slabcast_schedule::WorkerView;
+use slabcast_schedule::{WorkerIdentity, WorkerView};
 use std::collections::BTreeMap;
 use std::time::Instant;
 
@@ -93,6 +93,9 @@ fn check(hello: &Hello, rehearses: bool) -> Result<u32, AttachError> {
 /// One worker's link and what is known of it.
 struct Attached {
     link: WorkerLink,
+    /// Its name, as other parts show it.
+    name: String,
+    identity: WorkerIdentity,
     address: String,
     simd: String,
     memory_budget_bytes: u64,
@@ -107,6 +110,16 @@ pub(crate) struct Admitted {
     pub(crate) worker: WorkerId,
     /// Whether it draws on the master's machine.
     pub(crate) is_local: bool,
+    /// What it is over all its links.
+    pub(crate) identity: WorkerIdentity,
+}
+
+/// A worker, for the log.
+pub(crate) struct Who<'a> {
+    pub(crate) name: &'a str,
+    /// Its machine and its name there.
+    pub(crate) identity: &'a WorkerIdentity,
+    pub(crate) address: &'a str,
 }
 
 /// All workers that are linked.
@@ -145,8 +158,12 @@ impl WorkerTable {
         let heartbeat_ms = self.heartbeat_ms;
         let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms, protocol_version });
         let now = Instant::now();
+        let identity =
+            WorkerIdentity { host: caller.host(&hello.machine), name: hello.name.clone() };
         let attached = Attached {
             link,
+            name: hello.name.clone(),
+            identity: identity.clone(),
             address: caller.address,
             simd: hello.simd.clone(),
             memory_budget_bytes: hello.memory_budget_bytes,
@@ -156,7 +173,7 @@ impl WorkerTable {
             leaving: false,
         };
         self.attached.insert(worker, attached);
-        Ok(Admitted { worker, is_local })
+        Ok(Admitted { worker, is_local, identity })
     }
 
     /// Notes that a worker said `message`; false if there is no such worker.
@@ -172,6 +189,19 @@ impl WorkerTable {
     /// such worker.
     pub(crate) fn remove(&mut self, worker: WorkerId) -> Option<bool> {
         self.attached.remove(&worker).map(|a| a.leaving)
+    }
+
+    /// Sets the name that other parts show a worker by.
+    pub(crate) fn rename(&mut self, worker: WorkerId, name: &str) {
+        if let Some(attached) = self.attached.get_mut(&worker) {
+            attached.name = name.into();
+        }
+    }
+
+    /// What the log says of a worker.
+    pub(crate) fn who(&self, worker: WorkerId) -> Option<Who<'_>> {
+        let Attached { name, identity, address, .. } = self.attached.get(&worker)?;
+        Some(Who { name, identity, address })
     }
 
     /// A worker's link.

@@ -245,6 +245,7 @@ impl Driver {
         let worker = admitted.worker;
         let is_taken = self.scheduler.workers().iter().any(|w| w.name == hello.name);
         let name = if is_taken { format!("{}#{}", hello.name, worker.0) } else { hello.name };
+        self.workers.rename(worker, &name);
         info!(
             %worker, name, threads = hello.threads, simd = hello.simd,
             held_bricks = hello.held.iter().map(|h| h.1.len()).sum::<usize>(), "worker joined"
@@ -254,6 +255,7 @@ impl Driver {
             Happened::WorkerJoined {
                 worker,
                 name,
+                identity: admitted.identity,
                 threads: hello.threads,
                 is_local: admitted.is_local,
                 memory_budget_bytes: hello.memory_budget_bytes,

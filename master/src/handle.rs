@@ -165,7 +165,8 @@ impl Handle {
     }
 
     /// Submits a view path and returns its job. A request that was submitted before under its
-    /// `client_key` gives the job of that time. Must be called inside a tokio runtime: the
+    /// `client_key` gives the job of that time; if frames of it failed they are drawn again, and
+    /// no others. Must be called inside a tokio runtime: the
     /// request is checked on one of its blocking threads.
     ///
     /// # Errors
@@ -174,11 +175,12 @@ impl Handle {
     pub async fn submit(&self, request: PathRequest) -> Result<JobId, SubmitError> {
         check_key(&request.client_key)?;
         if let Some(job) = self.jobs.lock().by_key(&request.client_key) {
-            return if *job.request == request {
-                Ok(job.view.id)
-            } else {
-                Err(SubmitError::KeyTaken)
-            };
+            if *job.request != request {
+                return Err(SubmitError::KeyTaken);
+            }
+            if !job.may_retry() {
+                return Ok(job.view.id);
+            }
         }
         let place = self.planning.clone().acquire_owned().await.map_err(|_| SubmitError::Gone)?;
         let (served, hooks) = (self.served.clone(), self.hooks.clone());

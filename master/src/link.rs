@@ -107,6 +107,16 @@ pub struct Caller {
 }
 
 impl Caller {
+    /// The machine that a caller runs on, as far as the master can tell: `machine`, if it names
+    /// one, or its address without the port, so that the next connection has the same.
+    pub(crate) fn host(&self, machine: &str) -> String {
+        if !machine.is_empty() {
+            return machine.into();
+        }
+        let socket = self.address.parse::<std::net::SocketAddr>();
+        socket.map_or_else(|_| self.address.clone(), |s| s.ip().to_string())
+    }
+
     /// Whether a caller that says to be on `machine` shares the processors of a master on `own`.
     /// If one of them does not know its machine's name, the address decides: a caller from the
     /// address that it calls is on the machine that it calls. An address alone would not do, as
@@ -225,6 +235,15 @@ pub(crate) async fn serve_until(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn host_of_a_caller_is_the_same_for_all_its_connections() {
+        let from = |address: &str| Caller { address: address.into(), is_local: false };
+        assert_eq!(from("10.0.0.1:5").host(""), from("10.0.0.1:77").host(""));
+        assert_eq!(from("[fe80::1]:5").host(""), "fe80::1");
+        assert_eq!(from("10.0.0.1:5").host("boot-7"), from("10.0.0.2:5").host("boot-7"));
+        assert_eq!(from("").host(""), "");
+    }
 
     #[test]
     fn worker_is_on_the_masters_machine_by_machine_name_or_else_by_address() {

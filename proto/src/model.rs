@@ -24,7 +24,7 @@ pub enum JobState {
     Running,
     /// All frames are finished.
     Done,
-    /// The job can't be finished.
+    /// The job can't be finished, or is over with some frames failed.
     Failed,
     /// The job was cancelled.
     Cancelled,
@@ -58,6 +58,8 @@ pub struct JobNotice {
     pub state: JobState,
     /// Number of the job's frames that are finished.
     pub frames_done: u64,
+    /// Number of the job's frames that failed.
+    pub frames_failed: u64,
     /// Number of frames in the job's path.
     pub frames_total: u64,
     /// Render threads of the workers that are connected.
@@ -79,6 +81,8 @@ pub struct Job {
     pub message: String,
     /// Number of the job's frames that are finished.
     pub frames_done: u64,
+    /// Number of the job's frames that failed.
+    pub frames_failed: u64,
     /// Number of frames in the job's path.
     pub frames_total: u64,
     /// Width and height of the job's frames in pixels.
@@ -168,11 +172,22 @@ pub struct FrameChunk {
     pub trace_json: String,
 }
 
-/// One message of `WatchFrames`: a piece of a frame, or news of the job.
+/// A frame that could not be drawn.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct FrameFailure {
+    /// Number of the frame in its job, from 0.
+    pub frame: u64,
+    /// For people: which part of it failed, what the workers that tried it said, what to do.
+    pub reason: String,
+}
+
+/// One message of `WatchFrames`: a piece of a frame, its failure, or news of the job.
 #[derive(Clone, Debug, PartialEq)]
 pub enum WatchMessage {
     /// A piece of a frame.
     Chunk(FrameChunk),
     /// News of the job.
     Notice(JobNotice),
+    /// In place of a frame's chunks: it failed.
+    Failed(FrameFailure),
 }

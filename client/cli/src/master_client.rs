@@ -81,7 +81,8 @@ pub(crate) fn table<const N: usize>(out: &mut String, rows: &[[String; N]]) {
 pub(crate) fn job_json(j: &Job) -> serde_json::Value {
     serde_json::json!({
         "job": j.job_id, "client_key": j.client_key, "state": j.state.to_string(),
-        "message": j.message, "frames_done": j.frames_done, "frames_total": j.frames_total,
+        "message": j.message, "frames_done": j.frames_done, "frames_failed": j.frames_failed,
+        "frames_total": j.frames_total,
         "size": j.size, "submitted_unix_ms": j.submitted_unix_ms,
         "finished_unix_ms": j.finished_unix_ms,
     })

@@ -193,6 +193,10 @@ pub async fn submit(
                         trace_json: f.trace_json.clone().unwrap_or_default(),
                     })
                 }
+                Some(WatchItem::Failed { number, reason }) => {
+                    taken += 1;
+                    Ok(Update::FrameFailed { number, reason: reason.to_string() })
+                }
                 Some(WatchItem::Notice(view)) => match view.state {
                     JobState::Failed(reason) => Err(Fail::failed(reason)),
                     JobState::Cancelled => Err(Fail::failed("the job was cancelled")),

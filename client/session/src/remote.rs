@@ -119,7 +119,7 @@ async fn follow(
     let mut frames = client.follow(job, *next, PATIENCE).await?;
     let mut heard = Instant::now();
     let mut latest = Step { frames: *next, ..Step::default() };
-    let mut queued = false;
+    let (mut queued, mut failed) = (false, false);
     loop {
         let update = match tokio::time::timeout(SILENCE, frames.next()).await {
             Err(_) => {
@@ -137,7 +137,17 @@ async fn follow(
             }
             Ok(update) => {
                 heard = Instant::now();
-                match update? {
+                let update = match update {
+                    // The frames that failed were told one by one, and all others came.
+                    Err(ClientError::JobFailed { .. }) if failed => None,
+                    update => update?,
+                };
+                match update {
+                    Some(slabcast_client::Update::FrameFailed { number, reason }) => {
+                        *next = number + 1;
+                        failed = true;
+                        Update::FrameFailed { number, reason }
+                    }
                     Some(slabcast_client::Update::Notice(n)) => {
                         latest = step(&n, client.address());
                         queued = n.state == JobState::Queued;

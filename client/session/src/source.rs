@@ -28,7 +28,14 @@ pub enum Update {
         /// Time line as JSON; empty unless asked for.
         trace_json: String,
     },
-    /// The job ended with all frames delivered.
+    /// A frame could not be drawn; others come after it.
+    FrameFailed {
+        /// Number of the frame in its job, from 0.
+        number: u64,
+        /// Why, for people; one line.
+        reason: String,
+    },
+    /// The job ended with all frames delivered but those that failed.
     Done,
 }
 

@@ -6,7 +6,7 @@ use slabcast_common::ids::{BrickId, FrameId, WorkerId};
 use slabcast_common::image::{FrameState, SparseTile};
 use slabcast_common::message::ToWorker;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::stats::FrameStats;
+use slabcast_common::stats::{FrameStats, PoisonedTile};
 
 /// An output of the scheduler for its driver to carry out, from
 /// [`Scheduler::next_action`](crate::Scheduler::next_action).
@@ -68,12 +68,23 @@ pub enum Action {
         /// Timeline of the frame, ordered by end times.
         spans: Spans,
     },
-    /// A frame can't be rendered: every tile that was attempted was given up.
+    /// A frame can't be rendered: a tile of it was given up.
     FrameFailed {
         /// The frame.
         frame: FrameId,
-        /// Reason, for users.
+        /// Reason, for users: which tile, and what became of each worker that tried it.
         reason: String,
+        /// The tile.
+        tile: PoisonedTile,
+    },
+    /// A worker failed again and again: it is lent nothing for a while.
+    Paused {
+        /// The worker.
+        worker: WorkerId,
+        /// Failures that were not made up for by results.
+        failures: u32,
+        /// Duration of the pause in microseconds.
+        pause_us: Micros,
     },
 }
 

@@ -28,6 +28,22 @@ pub struct FrameJob {
     pub finish: Option<PixelEncoding>,
 }
 
+/// What a worker is over all its links, as far as the master can tell: two links of one identity
+/// are the same worker, whatever its id.
+#[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct WorkerIdentity {
+    /// The machine that it runs on, or the address that it calls from, without port.
+    pub host: String,
+    /// The name that it gives itself.
+    pub name: String,
+}
+
+impl std::fmt::Display for WorkerIdentity {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}/{}", self.host, self.name)
+    }
+}
+
 /// An input of the scheduler, given to [`Scheduler::handle`](crate::Scheduler::handle).
 #[derive(Clone, Debug)]
 pub enum Event {
@@ -37,6 +53,9 @@ pub enum Event {
         worker: WorkerId,
         /// Display name.
         name: String,
+        /// What the worker is over all its links. While another worker of the same identity is
+        /// linked, it counts as one more worker of that machine.
+        identity: WorkerIdentity,
         /// Number of render threads.
         threads: u32,
         /// Whether it runs on the master's host. Message handling then competes with its render

@@ -23,8 +23,8 @@
 //! +-------------------------------------------------------------------------------------------+
 //! | The law. A frame's bytes follow from its job alone: not from the number of workers, their |
 //! | threads, speed or memory, nor from the macrotile level, the slabs, the order of arrival,  |
-//! | or who dies when. Only a tile that takes `poison_after` workers with it breaks it, and it |
-//! | is named in the statistics.                                                               |
+//! | or who dies when. A frame of which a tile can't be drawn fails whole: none is done with a |
+//! | hole in it.                                                                               |
 //! +-------------------------------------------------------------------------------------------+
 //! ```
 //!
@@ -48,7 +48,7 @@ mod state;
 
 pub use account::spans::Spans;
 pub use action::{Action, Span, Totals, WorkerView};
-pub use event::{Event, FrameJob};
+pub use event::{Event, FrameJob, WorkerIdentity};
 pub use policy::macrotile;
 pub use policy::slab_borders::slab_ranges;
 pub use scheduler::Scheduler;
@@ -72,8 +72,9 @@ pub struct Config {
     pub silence: Micros,
     /// Deadline of a task's first lease, in microseconds. Each attempt doubles it.
     pub lease: Micros,
-    /// Number of distinct workers lost with a tile, or of refusals, after which the tile is given
-    /// up. If other workers are lost too, it takes more losses (see `state::task_queue`).
+    /// Number of different workers that must have failed at a tile before it is given up, and its
+    /// frame fails. A worker that is linked and has not failed at it is always asked first
+    /// (see `state::task_queue`).
     pub poison_after: u32,
     /// Leases in flight for each render thread, the one it renders included.
     pub queue_ahead: u32,

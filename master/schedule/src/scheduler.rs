@@ -7,9 +7,11 @@ use crate::policy::cost_model::CostModel;
 use crate::policy::link_use::{FrameLoad, LinkUse};
 use crate::state::cluster::Cluster;
 use crate::state::frame::{Frame, Step, StepContext, send_bricks, uses_regions};
+use crate::state::given_up::GivenUp;
 use crate::state::region_frame::RegionFrame;
+use crate::state::reputation::Reputations;
 use crate::state::residency::{Residency, Transfer};
-use crate::state::workers::{LANES, Roster, Worker};
+use crate::state::workers::{LANES, Newcomer, Roster, Worker};
 use crate::{Action, Clock, Config, Event, FrameJob, Micros, Totals, WorkerView};
 use slabcast_common::ids::{SceneId, WorkerId};
 use slabcast_common::link::FRAMES_IN_FLIGHT;
@@ -41,6 +43,7 @@ impl Scheduler {
             cluster: Cluster {
                 config,
                 roster: Roster::default(),
+                reputations: Reputations::default(),
                 residency: Residency::default(),
                 history: CostHistory::default(),
                 link_use: LinkUse::default(),
@@ -78,9 +81,21 @@ impl Scheduler {
         let cluster = &mut self.cluster;
         cluster.roster.watch(now, &cluster.config);
         match event {
-            Event::WorkerJoined { worker, name, threads, is_local, memory_budget_bytes, held } => {
+            Event::WorkerJoined {
+                worker,
+                name,
+                identity,
+                threads,
+                is_local,
+                memory_budget_bytes,
+                held,
+            } => {
                 cluster.residency.join(worker, memory_budget_bytes, held);
-                cluster.roster.join(worker, name, threads, is_local, now);
+                let identity = cluster.roster.free_identity(identity);
+                let reputation = cluster.reputations.recall(&identity);
+                let newcomer = Newcomer { name, identity, reputation, threads, is_local };
+                cluster.roster.join(worker, newcomer, now);
+                cluster.pause(worker, now);
                 for frame in &mut self.active {
                     frame.joined(cluster, worker, now);
                 }
@@ -125,6 +140,10 @@ impl Scheduler {
                             Err(reason) => self.drop_worker(worker, reason, false, now),
                             Ok(rendered) => {
                                 freed_worker = (!is_due).then_some(worker);
+                                let from = cluster.roster.get_mut(worker);
+                                if let Some(from) = from.filter(|_| rendered.is_some()) {
+                                    from.reputation.add_result();
+                                }
                                 if cluster.residency.is_lazy(worker) {
                                     let ledger = &mut frame.core_mut().ledger;
                                     send_bricks(cluster, Some(ledger), worker, now);
@@ -144,9 +163,10 @@ impl Scheduler {
                 cluster.roster.heard(worker, now);
                 let has_lent = |f: &&mut Frame| f.has_lent(worker, task, epoch);
                 if let Some(frame) = self.active.iter_mut().find(has_lent) {
-                    cluster.active_set.activate_all();
-                    cluster.roster.activate(usize::MAX);
-                    frame.failed(cluster, worker, task, epoch, reason);
+                    cluster.activate_all();
+                    frame.failed(cluster, worker, task, epoch, reason, now);
+                    cluster.strike(worker);
+                    cluster.pause(worker, now);
                 }
             }
             Event::HandedOver { worker, piece } => {
@@ -249,17 +269,24 @@ impl Scheduler {
         }
     }
 
-    /// Forgets a worker that is gone. `blame`: a task may have killed it.
+    /// Forgets a worker that is gone, but not what is held against it. `blame`: a task may have
+    /// killed it; else it was dropped for what it said.
     fn lose(&mut self, id: WorkerId, blame: bool, now: Micros) {
-        let Some(worker) = self.cluster.roster.remove(id) else { return };
+        let Some(mut worker) = self.cluster.roster.remove(id) else { return };
         self.cluster.totals.lost_workers += 1;
+        let mut was_drawing = false;
         let mut threads = worker.threads;
         for frame in &mut self.active {
             let leases = frame.core().leases(id);
             let blame = blame && !worker.leaving;
             frame.lost(&mut self.cluster, id, &worker, blame, threads, now);
             threads = threads.saturating_sub(leases);
+            was_drawing |= blame && leases > 0;
         }
+        if was_drawing || !blame {
+            worker.reputation.strike();
+        }
+        self.cluster.reputations.remember(&worker, now);
         if self.cluster.residency.transfer(id).is_some() {
             self.cluster.link_use.bricks_arrived(0, true, now);
         }
@@ -273,7 +300,7 @@ impl Scheduler {
     }
 
     /// Does what is due, and advances frames as far as possible.
-    fn advance(&mut self, freed_worker: Option<WorkerId>, clock: &dyn Clock) {
+    fn advance(&mut self, mut freed_worker: Option<WorkerId>, clock: &dyn Clock) {
         let now = clock.now();
         for worker in self.cluster.roster.silent(now, &self.cluster.config) {
             let secs = self.cluster.config.silence as f64 / 1e6;
@@ -282,10 +309,12 @@ impl Scheduler {
         for (worker, nonce) in self.cluster.roster.beat(now, &self.cluster.config) {
             self.cluster.send(worker, ToWorker::Ping { nonce });
         }
-        for frame in &mut self.active {
-            frame.tick(now);
+        if self.cluster.roster.end_pauses(now) {
+            freed_worker = None;
         }
-        let mut freed_worker = freed_worker;
+        for frame in &mut self.active {
+            frame.tick(&mut self.cluster, now);
+        }
         while self.step_frames(freed_worker, clock) {
             freed_worker = None;
         }
@@ -319,11 +348,12 @@ impl Scheduler {
             let context = StepContext { freed_worker, ..self.context(i, false) };
             match self.active[i].step(&mut self.cluster, context, clock) {
                 Step::Waits | Step::Done => i += 1,
-                Step::Failed(reason) => {
+                Step::Failed(given_up) => {
                     if let Some(mut failed) = self.active.remove(i) {
                         failed.end(&mut self.cluster);
                         let frame = failed.core().job.frame;
-                        self.cluster.out.push_back(Action::FrameFailed { frame, reason });
+                        let GivenUp { tile, reason } = *given_up;
+                        self.cluster.out.push_back(Action::FrameFailed { frame, reason, tile });
                     }
                     ended = true;
                 }

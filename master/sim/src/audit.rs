@@ -51,6 +51,8 @@ pub struct Audit {
     pub drops: Vec<(WorkerId, String)>,
     /// Frames that failed, with the scheduler's reasons.
     pub failed: BTreeMap<FrameId, String>,
+    /// Pauses of workers that failed again and again, in microseconds.
+    pub pauses: Vec<(WorkerId, Micros)>,
     /// Number of leases that were given.
     pub leases_given: u64,
     /// Hash of all actions and their times: two runs of a seed have the same.
@@ -295,10 +297,14 @@ impl Observer for Audit {
                 assert!(!j.is_cancelled, "seed {seed}: {frame} was cancelled");
                 assert!(!std::mem::replace(&mut j.is_over, true), "seed {seed}: {frame} twice");
             }
-            Action::FrameFailed { frame, reason } => {
+            Action::FrameFailed { frame, reason, .. } => {
                 self.note("failed", frame.0, 0, now);
                 self.jobs.get_mut(frame).expect("a frame that was queued").is_over = true;
                 self.failed.insert(*frame, reason.clone());
+            }
+            Action::Paused { worker, pause_us, .. } => {
+                self.note("paused", worker.0, *pause_us, now);
+                self.pauses.push((*worker, *pause_us));
             }
         }
     }

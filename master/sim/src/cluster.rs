@@ -22,7 +22,7 @@ use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, TaskId, WorkerId};
 use slabcast_common::link::{FINISHER_THREADS, stream_threads};
 use slabcast_common::message::ToWorker;
-use slabcast_schedule::{Clock, Event, FrameJob, Micros, Scheduler};
+use slabcast_schedule::{Clock, Event, FrameJob, Micros, Scheduler, WorkerIdentity};
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -246,6 +246,10 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         self.inbox.push(Event::WorkerJoined {
             worker: id,
             name: format!("w{}", id.0),
+            identity: WorkerIdentity {
+                host: profile.name.map_or_else(|| format!("host{}", id.0), str::to_string),
+                name: profile.name.map_or_else(|| format!("w{}", id.0), str::to_string),
+            },
             threads: profile.threads,
             is_local: profile.is_local,
             memory_budget_bytes: profile.memory_budget_bytes,

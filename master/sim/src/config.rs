@@ -181,6 +181,9 @@ pub struct WorkerProfile {
     pub brick_bytes_per_s: Option<f64>,
     /// Microseconds by which the worker's clock is ahead of the master's.
     pub clock_ahead_us: Micros,
+    /// Name of the worker and of its machine, by which it is known when it comes back; `None`: a
+    /// worker that was never there before.
+    pub name: Option<&'static str>,
     /// Faults that the worker has by itself.
     pub faults: Faults,
 }
@@ -200,6 +203,7 @@ impl Default for WorkerProfile {
             latency_ns: [0; 2],
             brick_bytes_per_s: None,
             clock_ahead_us: 0,
+            name: None,
             faults: Faults::default(),
         }
     }

@@ -1,15 +1,15 @@
 //! Carrying out the scheduler's actions, up to finished frames.
 
-use super::Driver;
+use super::{Driver, Flight};
 use crate::finish::{Assembly, FrameSums};
 use crate::finishers::FinishTask;
-use crate::jobs::FinishedFrame;
+use crate::jobs::{FinishedFrame, JobState};
 use crate::link::BrickOrder;
 use slabcast_common::ids::{FrameId, JobId};
 use slabcast_common::image::{FrameState, SparseTile};
 use slabcast_common::message::ToWorker;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::stats::FrameStats;
+use slabcast_common::stats::{FrameStats, PoisonedTile};
 use slabcast_schedule::{Action, Spans};
 use std::sync::Arc;
 use tracing::{debug, info, warn};
@@ -48,7 +48,17 @@ impl Driver {
                 Action::FrameDone { frame, state, stats, spans } => {
                     self.finish(frame, state, stats, spans);
                 }
-                Action::FrameFailed { frame, reason } => self.fail_frame(frame, &reason),
+                Action::FrameFailed { frame, reason, tile } => {
+                    self.give_up_frame(frame, reason, &tile);
+                }
+                Action::Paused { worker, failures, pause_us } => {
+                    let Some(who) = self.workers.who(worker) else { continue };
+                    warn!(
+                        worker = who.name, identity = %who.identity, address = who.address,
+                        failures, pause_ms = pause_us / 1000,
+                        "worker fails again and again: it is lent nothing for a while"
+                    );
+                }
             }
         }
     }
@@ -118,6 +128,23 @@ impl Driver {
         }
     }
 
+    /// Fails a frame of which no worker could draw a tile; its job goes on with the others.
+    fn give_up_frame(&mut self, frame: FrameId, reason: String, tile: &PoisonedTile) {
+        let Some(Flight { job, number, .. }) = self.flights.remove(&frame) else { return };
+        let PoisonedTile { slab, x, y, size, workers } = tile;
+        warn!(
+            %job, frame = number, slab, tile = format!("{x},{y}"), size,
+            workers = workers.join(", "), reason, "frame failed: a tile of it was given up"
+        );
+        let is_over = self.jobs.lock().fail_frame(job, number, reason);
+        if is_over {
+            warn!(%job, "job is over, and frames of it failed");
+            self.retire();
+        }
+        self.jobs.ring();
+        self.refresh_states();
+    }
+
     pub(super) fn finished(&mut self, id: JobId, flight: FrameId, frame: FinishedFrame) {
         // A frame of a job that has ended meanwhile is nobody's.
         let Some(flight) = self.flights.remove(&flight) else { return };
@@ -128,11 +155,17 @@ impl Driver {
         self.log_reserve();
         let number = frame.number;
         let mut table = self.jobs.lock();
-        let is_done = table.put(id, frame);
+        let is_over = table.put(id, frame);
+        let state = table.get(id).map(|job| job.view.state.clone());
         table.evict(self.frame_budget_bytes, (id, number));
         drop(table);
-        if is_done {
-            info!(job = %id, "job done");
+        if is_over {
+            match state {
+                Some(JobState::Incomplete(_)) => {
+                    warn!(job = %id, "job is over, and frames of it failed");
+                }
+                _ => info!(job = %id, "job done"),
+            }
             self.retire();
         }
         self.jobs.ring();

@@ -19,16 +19,21 @@ const MAX_OPEN_JOBS: usize = 200;
 impl Driver {
     pub(super) fn submit(&mut self, plan: Plan) -> Result<JobId, SubmitError> {
         // Another request may have come under this key while this one was checked.
-        if let Some(job) = self.jobs.lock().by_key(&plan.request.client_key) {
-            let is_same = *job.request == *plan.request;
-            return if is_same { Ok(job.view.id) } else { Err(SubmitError::KeyTaken) };
+        let table = self.jobs.lock();
+        if let Some(job) = table.by_key(&plan.request.client_key) {
+            if *job.request != *plan.request {
+                return Err(SubmitError::KeyTaken);
+            }
+            let (id, may_retry) = (job.view.id, job.may_retry());
+            drop(table);
+            if may_retry {
+                self.retry(id, plan);
+            }
+            return Ok(id);
         }
+        drop(table);
         if self.active.len() >= MAX_OPEN_JOBS {
             return Err(SubmitError::Full);
-        }
-        let store = self.brick_sets.covering(&plan.wanted).cloned();
-        if let Some(store) = &store {
-            self.brick_sets.keep(store, |key| self.active.needs(key));
         }
         let mut table = self.jobs.lock();
         let id = table.next_id();
@@ -36,13 +41,36 @@ impl Driver {
         info!(job = %id, frames = entry.view.frames_total, sums = ?plan.quality().sums, "job submitted");
         table.insert(entry);
         drop(table);
+        self.activate(id, plan, 0);
+        Ok(id)
+    }
 
+    /// Draws the failed frames of a job again, and no others.
+    fn retry(&mut self, id: JobId, plan: Plan) {
+        let frames = self.jobs.lock().reopen(id);
+        info!(job = %id, frames, "failed frames are drawn again");
+        if self.active.contains(id) {
+            self.refresh_states();
+        } else {
+            self.activate(id, plan, u64::MAX);
+        }
+        self.jobs.ring();
+    }
+
+    /// Makes a job active: its frames from number `next` on are drawn, and those that are wanted
+    /// again.
+    fn activate(&mut self, id: JobId, plan: Plan, next: u64) {
+        let store = self.brick_sets.covering(&plan.wanted).cloned();
+        if let Some(store) = &store {
+            self.brick_sets.keep(store, |key| self.active.needs(key));
+        }
         let bricks = match &store {
             Some(store) => store.key(),
             None => plan.wanted.set_key(self.served.info.digest),
         };
         let must_cut = store.is_none();
-        let job = plan.activate(id, self.served.info.clone(), bricks, store);
+        let mut job = plan.activate(id, self.served.info.clone(), bricks, store);
+        job.next = next.min(job.views.len() as u64);
         let wanted = must_cut.then(|| job.wanted.clone());
         self.active.insert(id, job);
         if let Some(wanted) = wanted {
@@ -58,11 +86,10 @@ impl Driver {
             let thread = std::thread::Builder::new().name("slabcast-bricks".into());
             if let Err(e) = thread.spawn(cut) {
                 self.fail_job(id, format!("no thread to cut bricks: {e}"));
-                return Ok(id);
+                return;
             }
         }
         self.refresh_states();
-        Ok(id)
     }
 
     pub(super) fn bricks_cut(&mut self, id: JobId, store: Result<Arc<BrickStore>, Panicked>) {
@@ -163,7 +190,7 @@ impl Driver {
         self.end_job(job, JobState::Failed(reason));
     }
 
-    /// Fails the job of a frame. Does nothing if its job has ended already.
+    /// Fails the job of a frame that the master itself can't finish. Does nothing if its job has ended already.
     pub(super) fn fail_frame(&mut self, frame: FrameId, reason: &str) {
         if let Some(flight) = self.flights.get(&frame) {
             let (job, number) = (flight.job, flight.number);

@@ -43,6 +43,15 @@ fn request(key: &str, frames: u32, preset: &str) -> PathRequest {
 /// A worker that draws nothing: it answers each lease with clear pixels, and pings with pongs. It
 /// asks for the first brick of each directory. Counts the pings in `pings`.
 fn join(handle: &Handle, pings: Arc<AtomicUsize>) {
+    join_unless(handle, pings, |_| false);
+}
+
+/// A worker as [`join`] has it, which refuses the tiles of frames that `refuses` says.
+fn join_unless(
+    handle: &Handle,
+    pings: Arc<AtomicUsize>,
+    refuses: impl Fn(FrameId) -> bool + Send + 'static,
+) {
     let mut end = crate::link::embedded(handle.clone());
     tokio::spawn(async move {
         let hello = Hello {
@@ -60,6 +69,11 @@ fn join(handle: &Handle, pings: Arc<AtomicUsize>) {
         let _ = end.replies.send(ToMaster::Hello(hello)).await;
         while let Some(message) = end.control.recv().await {
             let reply = match message {
+                ToWorker::Region(lease) if refuses(lease.frame) => ToMaster::Failed {
+                    task: lease.task,
+                    epoch: lease.epoch,
+                    reason: "out of\n\x1b[31mmemory".into(),
+                },
                 ToWorker::Region(lease) => {
                     let n = lease.tile.area();
                     let pixels =
@@ -262,5 +276,58 @@ async fn submitting_a_long_path_delays_no_heartbeat() {
     let job = submitting.await.expect("no panic").expect("a good request");
     assert_eq!(handle.job(job).map(|job| job.frames_total), Some(100_000));
     assert!(handle.cancel(job).await);
+    master.shutdown().await;
+}
+
+/// A frame that no worker can draw fails alone, and the same request draws it again, and no other.
+#[tokio::test]
+async fn frame_that_fails_is_told_in_its_place_and_drawn_again_alone() {
+    let volume = Volume::from_fn_u8("v", [24; 3], |i, j, k| (i * 7 + j * 3 + k) as u8);
+    let orientation = Orientation::new(None, None).expect("defaults");
+    let mut config = MasterConfig::new(volume, orientation);
+    config.schedule.poison_after = 1;
+    let master = Master::start(config).expect("a master");
+    let handle = master.handle();
+    let (sick, lent) = (Arc::new(AtomicUsize::new(2)), Arc::new(Mutex::new(Vec::new())));
+    let (is_sick, seen) = (sick.clone(), lent.clone());
+    join_unless(&handle, Arc::default(), move |frame| {
+        seen.lock().expect("no panic").push(frame.0);
+        frame.0 == is_sick.load(Ordering::Relaxed) as u64
+    });
+    let job = handle.submit(request("a", 3, "grey")).await.expect("a good request");
+    let watched = async |from| {
+        let mut watch = handle.watch(job, from).expect("a job");
+        let mut told = Vec::new();
+        while let Some(item) = watch.next().await {
+            match item {
+                WatchItem::Frame(frame) => told.push((frame.number, String::new())),
+                WatchItem::Failed { number, reason } => told.push((number, reason.to_string())),
+                WatchItem::Notice(_) => {}
+            }
+        }
+        told
+    };
+    let told = watched(0).await;
+    assert_eq!(told.iter().map(|t| t.0).collect::<Vec<_>>(), [0, 1, 2]);
+    assert!(told[0].1.is_empty() && told[2].1.is_empty());
+    assert!(told[1].1.contains("clear refused it: out of  [31mmemory"), "{:?}", told[1]);
+    let view = handle.job(job).expect("it is remembered");
+    let JobState::Incomplete(reason) = &view.state else { panic!("{:?}", view.state) };
+    assert!(reason.starts_with("1 of 3 frames failed; frame 1: no worker could"), "{reason}");
+    assert_eq!((view.frames_done, view.frames_failed), (2, 1));
+    assert!(view.finished_unix_ms > 0);
+
+    sick.store(0, Ordering::Relaxed);
+    lent.lock().expect("no panic").clear();
+    assert_eq!(handle.submit(request("a", 3, "grey")).await, Ok(job), "the same job");
+    assert_eq!(watched(0).await.iter().map(|t| t.0).collect::<Vec<_>>(), [0, 1, 2]);
+    let view = handle.job(job).expect("it is remembered");
+    assert_eq!((view.state, view.frames_done, view.frames_failed), (JobState::Done, 3, 0));
+    let mut drawn = std::mem::take(&mut *lent.lock().expect("no panic"));
+    drawn.dedup();
+    assert_eq!(drawn, [4], "one frame was drawn, and no other");
+    // Nothing is left to be drawn again.
+    assert_eq!(handle.submit(request("a", 3, "grey")).await, Ok(job));
+    assert!(lent.lock().expect("no panic").is_empty());
     master.shutdown().await;
 }

@@ -121,6 +121,10 @@ impl ActiveJobs {
             if let Some(number) = again {
                 return Some((*id, number));
             }
+            let retried = job.retried.iter().copied().find(|n| !is_in_flight(*id, *n));
+            if let Some(number) = retried.filter(|_| has_room || !job.has_untaken()) {
+                return Some((*id, number));
+            }
             if active.next < active.views.len() as u64 && (has_room || !job.has_untaken()) {
                 return Some((*id, active.next));
             }

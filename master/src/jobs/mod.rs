@@ -28,6 +28,9 @@ use tokio::sync::watch;
 /// Most jobs that a master remembers. Beyond it, the oldest jobs that are over are forgotten.
 pub const MAX_JOBS: usize = 1000;
 
+/// Reasons of failed frames that a job keeps; later failures are told by the last of them.
+const MAX_REASONS: usize = 100;
+
 /// State of a job, from its queue to its end.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum JobState {
@@ -41,6 +44,9 @@ pub enum JobState {
     Running,
     /// All frames are done.
     Done,
+    /// Each frame is done or failed, and some failed, as this says. The same request under the
+    /// same key draws those again.
+    Incomplete(String),
     /// The job can't go on, for this reason.
     Failed(String),
     /// A client cancelled it.
@@ -48,9 +54,10 @@ pub enum JobState {
 }
 
 impl JobState {
-    /// Returns whether the job is done, failed or cancelled, so that its state changes no more.
+    /// Returns whether no frame of the job is drawn any more unless somebody asks for it.
     pub fn is_over(&self) -> bool {
-        matches!(self, JobState::Done | JobState::Failed(_) | JobState::Cancelled)
+        use JobState::*;
+        matches!(self, Done | Incomplete(_) | Failed(_) | Cancelled)
     }
 }
 
@@ -65,6 +72,8 @@ pub struct JobView {
     pub state: JobState,
     /// Number of frames that were finished at least once.
     pub frames_done: u64,
+    /// Number of frames that failed.
+    pub frames_failed: u64,
     /// Number of frames of the path.
     pub frames_total: u64,
     /// Macrotiles of the current slab: done, and in all.
@@ -118,6 +127,10 @@ pub(crate) struct Job {
     untaken: (usize, usize),
     /// Numbers of frames that were dropped and are asked for again.
     pub(crate) wanted_again: BTreeSet<u64>,
+    /// Frames that failed, and why.
+    failed: BTreeMap<u64, Arc<str>>,
+    /// Numbers of frames that failed and are to be drawn again.
+    pub(crate) retried: BTreeSet<u64>,
     /// Whether frames that were dropped can't be rendered again.
     retired: bool,
 }
@@ -133,6 +146,8 @@ impl Job {
             taken: BTreeSet::new(),
             untaken: (0, 0),
             wanted_again: BTreeSet::new(),
+            failed: BTreeMap::new(),
+            retried: BTreeSet::new(),
             retired: false,
         }
     }
@@ -140,6 +155,31 @@ impl Job {
     /// Returns the first frame from `number` on whose pixels are kept.
     pub(crate) fn first_kept(&self, number: u64) -> Option<u64> {
         self.frames.range(number..).next().map(|(number, _)| *number)
+    }
+
+    /// Whether it is over and has failed frames that may be drawn again.
+    pub(crate) fn may_retry(&self) -> bool {
+        matches!(self.view.state, JobState::Incomplete(_)) && !self.failed.is_empty()
+    }
+
+    /// The end of the job, if all its frames have come to one.
+    fn end(&self) -> Option<JobState> {
+        let ended = self.ever_done.len() + self.failed.len();
+        if (ended as u64) < self.view.frames_total || self.view.state.is_over() {
+            return None;
+        }
+        let Some((number, reason)) = self.failed.first_key_value() else {
+            return Some(JobState::Done);
+        };
+        let number = self.request.path.first_frame() as u64 + number;
+        let (failed, total) = (self.failed.len(), self.view.frames_total);
+        let said = format!("{failed} of {total} frames failed; frame {number}: {reason}");
+        Some(JobState::Incomplete(said))
+    }
+
+    fn count(&mut self) {
+        self.view.frames_done = self.ever_done.len() as u64;
+        self.view.frames_failed = self.failed.len() as u64;
     }
 
     /// Whether it keeps a frame that nobody has taken.
@@ -238,7 +278,7 @@ impl Table {
         }
     }
 
-    /// Puts a finished frame in. True if it was the last that its job lacked: the job is done
+    /// Puts a finished frame in. True if it was the last that its job lacked: the job is over
     /// then, in one step with its last frame, so that whoever sees that frame sees the state.
     pub(crate) fn put(&mut self, id: JobId, frame: FinishedFrame) -> bool {
         let Some(job) = self.jobs.get_mut(&id) else { return false };
@@ -257,12 +297,51 @@ impl Table {
         job.count_untaken(bytes);
         self.untaken_bytes += if is_open { bytes } else { 0 };
         job.ever_done.insert(number);
-        job.view.frames_done = job.ever_done.len() as u64;
-        let is_done = job.view.frames_done == job.view.frames_total && is_open;
-        if is_done {
-            self.set_state(id, JobState::Done);
-        }
-        is_done
+        job.failed.remove(&number);
+        job.count();
+        let end = job.end();
+        let is_over = end.is_some();
+        end.into_iter().for_each(|end| self.set_state(id, end));
+        is_over
+    }
+
+    /// Notes that a frame can't be drawn, and why. True if it was the last that its job lacked:
+    /// the job is over then.
+    pub(crate) fn fail_frame(&mut self, id: JobId, number: u64, reason: String) -> bool {
+        let Some(job) = self.jobs.get_mut(&id) else { return false };
+        // A path of 100,000 frames that all fail for one reason holds it once.
+        let last = job.failed.last_key_value().map(|(_, last)| last.clone());
+        let reason = match last {
+            Some(last) if job.failed.len() >= MAX_REASONS || *last == *reason => last,
+            _ => reason.into(),
+        };
+        job.failed.insert(number, reason);
+        // It may have been drawn, dropped and asked for again.
+        job.ever_done.remove(&number);
+        job.wanted_again.remove(&number);
+        job.retried.remove(&number);
+        job.count();
+        let end = job.end();
+        let is_over = end.is_some();
+        end.into_iter().for_each(|end| self.set_state(id, end));
+        is_over
+    }
+
+    /// Why a frame failed, if it did.
+    fn failure(&self, id: JobId, number: u64) -> Option<Arc<str>> {
+        self.jobs.get(&id)?.failed.get(&number).cloned()
+    }
+
+    /// Puts a job that is over back to work for the frames that failed. Returns how many.
+    pub(crate) fn reopen(&mut self, id: JobId) -> usize {
+        let Some(job) = self.jobs.get_mut(&id).filter(|job| job.may_retry()) else { return 0 };
+        job.retried.extend(std::mem::take(&mut job.failed).into_keys());
+        job.view.state = JobState::Queued;
+        job.view.finished_unix_ms = 0;
+        job.retired = false;
+        job.count();
+        self.untaken_bytes += job.untaken.1;
+        job.retried.len()
     }
 
     /// Takes a frame for a watcher; the table keeps it.
@@ -291,6 +370,7 @@ impl Table {
     pub(crate) fn rendering_again(&mut self, id: JobId, number: u64) {
         if let Some(job) = self.jobs.get_mut(&id) {
             job.wanted_again.remove(&number);
+            job.retried.remove(&number);
         }
     }
 

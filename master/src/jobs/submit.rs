@@ -124,6 +124,7 @@ impl Plan {
                 client_key: request.client_key.clone(),
                 state: JobState::Queued,
                 frames_done: 0,
+                frames_failed: 0,
                 frames_total: self.views.len() as u64,
                 tiles: (0, 0),
                 slab: (0, 0),

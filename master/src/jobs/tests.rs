@@ -67,6 +67,7 @@ fn job(id: JobId, frames: u64) -> Job {
         client_key,
         state: JobState::Running,
         frames_done: 0,
+        frames_failed: 0,
         frames_total: frames,
         tiles: (0, 0),
         slab: (0, 0),

@@ -16,6 +16,13 @@ pub enum WatchItem {
     Notice(JobView),
     /// The next frame, in order.
     Frame(Arc<FinishedFrame>),
+    /// The next frame failed; others come after it.
+    Failed {
+        /// Number of the frame in its job, from 0.
+        number: u64,
+        /// Why it could not be drawn, for users.
+        reason: Arc<str>,
+    },
 }
 
 /// Shortest time between two notices that tell of tiles alone. A frame of 64 tiles may take 20 ms:
@@ -27,6 +34,7 @@ pub(crate) const TILE_NEWS: Duration = Duration::from_millis(40);
 struct News {
     state: JobState,
     frames_done: u64,
+    frames_failed: u64,
     workers: u32,
     tiles: (u32, u32),
     slab: (u32, u32),
@@ -37,6 +45,7 @@ impl News {
         News {
             state: view.state.clone(),
             frames_done: view.frames_done,
+            frames_failed: view.frames_failed,
             workers: view.workers,
             tiles: view.tiles,
             slab: view.slab,
@@ -45,8 +54,8 @@ impl News {
 
     /// Whether `next` tells something else, apart from tiles and slabs.
     fn differs_beyond_tiles(&self, next: &News) -> bool {
-        (&self.state, self.frames_done, self.workers)
-            != (&next.state, next.frames_done, next.workers)
+        let facts = |n: &News| (n.frames_done, n.frames_failed, n.workers);
+        self.state != next.state || facts(self) != facts(next)
     }
 }
 
@@ -100,6 +109,10 @@ impl Watch {
                     // The driver may render ahead again. If it is busy it will see for itself.
                     let _ = self.driver.try_send(Event::FrameTaken);
                     return Some(WatchItem::Frame(frame));
+                }
+                if let Some(reason) = table.failure(self.job, self.next) {
+                    self.next += 1;
+                    return Some(WatchItem::Failed { number: self.next - 1, reason });
                 }
                 let Some(job) = table.get(self.job) else {
                     self.is_over = true;

@@ -51,8 +51,8 @@ use std::fmt;
 
 /// Version of the file's format. Since 2 results may be finished, and statistics count their
 /// bytes; since 3 regions may be handed over in part; since 4 scenes have their transfer function
-/// as a message ([`legacy`] reads those of 3).
-const VERSION: u32 = 4;
+/// as a message ([`legacy`] reads those of 3); since 5 workers are known over their links.
+const VERSION: u32 = 5;
 
 /// Oldest version that is read.
 const OLDEST_VERSION: u32 = 3;
@@ -113,6 +113,10 @@ enum Noted {
 struct NotedWorker {
     w: u64,
     name: String,
+    /// Its machine and its name there, which tell it from others; without, each link counts as a
+    /// worker of its own (before version 5).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    who: Option<(String, String)>,
     threads: u32,
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     here: bool,
@@ -245,6 +249,7 @@ enum Decision {
     Finished { frame: u64, tiles: usize },
     Done { frame: u64, stats: Box<FrameStats> },
     Failed { frame: u64, reason: String },
+    Paused { worker: u64, pause_us: u64 },
 }
 
 #[derive(Debug)]
@@ -303,8 +308,11 @@ impl Decision {
             Action::FrameDone { frame, stats, .. } => {
                 Decision::Done { frame: frame.0, stats: stats.clone() }
             }
-            Action::FrameFailed { frame, reason } => {
+            Action::FrameFailed { frame, reason, .. } => {
                 Decision::Failed { frame: frame.0, reason: reason.clone() }
+            }
+            Action::Paused { worker, pause_us, .. } => {
+                Decision::Paused { worker: worker.0, pause_us: *pause_us }
             }
         }
     }
@@ -382,6 +390,7 @@ impl fmt::Display for Decision {
                 write!(f, "f{frame}: done in {ms} ms, statistics {hash:016x}")
             }
             Decision::Failed { frame, reason } => write!(f, "f{frame}: failed, {reason}"),
+            Decision::Paused { worker, pause_us } => write!(f, "w{worker}: pauses {pause_us} us"),
         }
     }
 }
@@ -463,19 +472,26 @@ fn from_hex(text: &str) -> Option<Vec<u8>> {
 fn noted(event: &Event, is_shut: impl Fn(&TileResult, f32) -> bool) -> Option<Noted> {
     let set = |key: &slabcast_common::brick::BrickSetKey| key.0.to_string();
     Some(match event {
-        Event::WorkerJoined { worker, name, threads, is_local, memory_budget_bytes, held } => {
-            Noted::Joined(NotedWorker {
-                w: worker.0,
-                name: name.clone(),
-                threads: *threads,
-                here: *is_local,
-                memory: *memory_budget_bytes,
-                held: held
-                    .iter()
-                    .map(|(key, ids)| (set(key), ids.iter().map(|b| b.0).collect()))
-                    .collect(),
-            })
-        }
+        Event::WorkerJoined {
+            worker,
+            name,
+            identity,
+            threads,
+            is_local,
+            memory_budget_bytes,
+            held,
+        } => Noted::Joined(NotedWorker {
+            w: worker.0,
+            name: name.clone(),
+            who: Some((identity.host.clone(), identity.name.clone())),
+            threads: *threads,
+            here: *is_local,
+            memory: *memory_budget_bytes,
+            held: held
+                .iter()
+                .map(|(key, ids)| (set(key), ids.iter().map(|b| b.0).collect()))
+                .collect(),
+        }),
         Event::WorkerHeard { worker } => Noted::Heard { w: worker.0 },
         Event::WorkerLost { worker, reason } => Noted::Lost { w: worker.0, reason: reason.clone() },
         Event::WorkerLeaving { worker } => Noted::Leaving { w: worker.0 },

@@ -19,7 +19,7 @@ use slabcast_common::message::{
 use slabcast_common::occlusion::Rect;
 use slabcast_common::volume::Digest32;
 use slabcast_proto::{cluster_v1, convert};
-use slabcast_schedule::{Clock, Config, Event, FrameJob, Micros, Scheduler};
+use slabcast_schedule::{Clock, Config, Event, FrameJob, Micros, Scheduler, WorkerIdentity};
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::io::{BufRead, Read};
@@ -334,7 +334,7 @@ fn recorded_clock(t: Vec<u64>, seen: &mut Seen) -> Result<RecordedClock, String>
 fn event(e: Noted, seen: &mut Seen) -> Result<Event, String> {
     let ids = |ids: Vec<u32>| ids.into_iter().map(BrickId).collect::<Vec<_>>();
     Ok(match e {
-        Noted::Joined(NotedWorker { w, name, threads, here, memory, held }) => {
+        Noted::Joined(NotedWorker { w, name, who, threads, here, memory, held }) => {
             if !seen.workers.insert(w) {
                 return Err(format!("w{w} joined before; a worker's name is never used again"));
             }
@@ -344,7 +344,17 @@ fn event(e: Noted, seen: &mut Seen) -> Result<Event, String> {
                 .collect::<Result<_, String>>()?;
             let worker = WorkerId(w);
             let (is_local, memory_budget_bytes) = (here, memory);
-            Event::WorkerJoined { worker, name, threads, is_local, memory_budget_bytes, held }
+            let (host, own) = who.unwrap_or_else(|| (String::new(), format!("{name} {w}")));
+            let identity = WorkerIdentity { host, name: own };
+            Event::WorkerJoined {
+                worker,
+                name,
+                identity,
+                threads,
+                is_local,
+                memory_budget_bytes,
+                held,
+            }
         }
         Noted::Heard { w } => Event::WorkerHeard { worker: WorkerId(w) },
         Noted::Lost { w, reason } => Event::WorkerLost { worker: WorkerId(w), reason },

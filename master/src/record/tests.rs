@@ -19,7 +19,7 @@ use slabcast_common::volume::{Digest32, Volume};
 use slabcast_scene::path::Orientation;
 use slabcast_scene::path::{Turntable, ViewPath};
 use slabcast_scene::presets;
-use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros};
+use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, WorkerIdentity};
 use std::cell::Cell;
 use std::io::Write;
 use std::sync::{Arc, Mutex};
@@ -140,6 +140,7 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, RecordSummary) {
                 let (is_local, memory_budget_bytes) = (rng.below(2) == 0, budget);
                 Some(Event::WorkerJoined {
                     worker,
+                    identity: WorkerIdentity { host: "here".into(), name: name.clone() },
                     name,
                     threads,
                     is_local,
@@ -292,7 +293,7 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, RecordSummary) {
 fn recorded_runs_replay_identically() {
     let (mut frames, mut dropped, mut dropped_finished) = (0, 0, [0; 3]);
     let mut pieces = 0;
-    for seed in 0..48 {
+    for seed in 0..72 {
         let schedule = if seed % 2 == 0 { Schedule::Slab } else { Schedule::Region };
         let (bytes, written) = recorded(seed, schedule);
         let done = replay(&bytes[..]).unwrap_or_else(|e| panic!("seed {seed}: {e}"));
@@ -380,7 +381,7 @@ fn replay_names_the_line_of_a_broken_file() {
     let (line, bad) = tampered(&bytes, any, |_| "{\"event\":5}".into());
     assert!(says(&bad).starts_with(&format!("line {line}: is not a line of a record")));
     let head = |l: &str| l.starts_with("{\"record\"");
-    let (_, bad) = tampered(&bytes, head, |l| l.replace("\"version\":4", "\"version\":7"));
+    let (_, bad) = tampered(&bytes, head, |l| l.replace("\"version\":5", "\"version\":7"));
     assert!(says(&bad).contains("version 7"), "{}", says(&bad));
     let scene = |l: &str| l.starts_with("{\"scene\"");
     let (line, bad) = tampered(&bytes, scene, |l| l.replace("\"wire\":\"", "\"wire\":\"ff"));

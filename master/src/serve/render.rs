@@ -67,7 +67,9 @@ fn state(state: &JobState) -> (model::JobState, String) {
         ),
         JobState::Running => (model::JobState::Running, String::new()),
         JobState::Done => (model::JobState::Done, String::new()),
-        JobState::Failed(reason) => (model::JobState::Failed, reason.clone()),
+        JobState::Failed(reason) | JobState::Incomplete(reason) => {
+            (model::JobState::Failed, reason.clone())
+        }
         JobState::Cancelled => (model::JobState::Cancelled, String::new()),
     }
 }
@@ -88,6 +90,7 @@ pub fn notice(job: &JobView) -> JobNotice {
     JobNotice {
         state,
         frames_done: job.frames_done,
+        frames_failed: job.frames_failed,
         frames_total: job.frames_total,
         render_threads: job.workers,
         message,
@@ -102,6 +105,7 @@ fn job_to_wire(view: &JobView) -> wire::Job {
         state,
         message,
         frames_done: view.frames_done,
+        frames_failed: view.frames_failed,
         frames_total: view.frames_total,
         size: view.size,
         format: view.format,
@@ -287,6 +291,10 @@ async fn send_frames(
                 out.send(Ok(convert::notice_to_wire(&notice(&news)))).await?;
                 view = news;
             }
+            Some(WatchItem::Failed { number, reason }) => {
+                next = number + 1;
+                out.send(Ok(convert::frame_failed_to_wire(number, &reason))).await?;
+            }
             Some(WatchItem::Frame(f)) => {
                 next = f.number + 1;
                 let trace = f.trace_json.as_deref().unwrap_or("");
@@ -298,7 +306,7 @@ async fn send_frames(
             }
         }
     }
-    if view.state == JobState::Done && next < view.frames_total {
+    if matches!(view.state, JobState::Done | JobState::Incomplete(_)) && next < view.frames_total {
         let message = format!("frame {next} is no longer kept; submit the path anew");
         let mut metadata = vec![("frame", next.to_string())];
         let kept = handle.first_kept_frame(view.id, next);

@@ -216,13 +216,16 @@ fn state() -> impl Strategy<Value = model::JobState> {
 }
 
 pub fn notice() -> impl Strategy<Value = model::JobNotice> {
-    (state(), any::<[u64; 2]>(), any::<u32>(), ".{0,50}").prop_map(
-        |(state, [frames_done, frames_total], render_threads, message)| model::JobNotice {
-            state,
-            frames_done,
-            frames_total,
-            render_threads,
-            message,
+    (state(), any::<[u64; 3]>(), any::<u32>(), ".{0,50}").prop_map(
+        |(state, [frames_done, frames_failed, frames_total], render_threads, message)| {
+            model::JobNotice {
+                state,
+                frames_done,
+                frames_failed,
+                frames_total,
+                render_threads,
+                message,
+            }
         },
     )
 }
@@ -240,6 +243,7 @@ pub fn job() -> impl Strategy<Value = model::Job> {
             state: n.state,
             message,
             frames_done: n.frames_done,
+            frames_failed: n.frames_failed,
             frames_total: n.frames_total,
             size,
             format,

@@ -1,4 +1,4 @@
-//! Looks at each frame for what a person should hear of: blank pictures, missing tiles, rehearsals.
+//! Looks at each frame for what a person should hear of: blank pictures, failures, rehearsals.
 
 use slabcast_common::stats::FrameStats;
 use slabcast_common::volume::VolumeInfo;
@@ -12,7 +12,7 @@ use slabcast_session::request::RenderRequest;
 pub(super) struct FrameCheck {
     blank: Vec<u64>,
     why: Option<String>,
-    incomplete: Vec<u64>,
+    failed: Vec<u64>,
     rehearsed: bool,
 }
 
@@ -26,9 +26,6 @@ impl FrameCheck {
         request: &RenderRequest,
     ) {
         self.rehearsed |= stats.rehearsed;
-        if !stats.poisoned.is_empty() {
-            self.incomplete.push(frame.number);
-        }
         let pixel = frame.format.bytes();
         // Each pixel is the one before it.
         let all_same = frame.bytes.len() < pixel
@@ -78,16 +75,25 @@ impl FrameCheck {
         }
     }
 
-    /// Returns a failure if frames lack tiles.
+    /// Notes that a frame failed, by its number on the whole path.
+    pub(super) fn failed(&mut self, number: u64) {
+        self.failed.push(number);
+    }
+
+    /// Returns a failure if frames failed.
     pub(super) fn verdict(&self) -> Result<(), Fail> {
-        match &self.incomplete[..] {
-            [] => Ok(()),
-            some => Err(Fail::failed(format!(
-                "frame {} has tiles that were given up after three workers were lost with them \
-                 (--stats lists them as `poisoned`); see the workers' logs, then render again with \
-                 --force",
-                some.iter().map(u64::to_string).collect::<Vec<_>>().join(", ")
-            ))),
-        }
+        let (first, last) = match &self.failed[..] {
+            [] => return Ok(()),
+            [first, .., last] => (first, last),
+            [one] => (one, one),
+        };
+        let which = match self.failed.len() {
+            1 => format!("frame {first}"),
+            n => format!("{n} frames, {first} the first and {last} the last of them,"),
+        };
+        Err(Fail::failed(format!(
+            "{which} failed, and the others are kept; see the workers' logs, then draw what is missing \
+             with `--frames {first}..{last} --force`"
+        )))
     }
 }

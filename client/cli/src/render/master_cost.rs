@@ -57,7 +57,7 @@ async fn told(run: &mut Run, volume: Arc<Volume>, orientation: Orientation) -> B
                 return stats.expect("statistics");
             }
             Update::Step(_) => {}
-            Update::Done => panic!("no frame came"),
+            Update::FrameFailed { .. } | Update::Done => panic!("no frame came"),
         }
     }
 }

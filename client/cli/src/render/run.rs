@@ -162,6 +162,12 @@ impl Run {
                             };
                             writer.put(frame, made);
                         }
+                        Some(Ok(Update::FrameFailed { number, reason })) => {
+                            step.frames = step.frames.max(number + 1);
+                            let number = number + request.path.first_frame() as u64;
+                            progress::warn(&format!("frame {number} failed: {reason}"));
+                            check.failed(number);
+                        }
                         Some(Ok(Update::Done)) => return Ok(()),
                         Some(Err(e)) => return Err(e),
                         None => return Err(Fail::failed("the job's updates ended early")),
@@ -204,6 +210,13 @@ impl Run {
             return Err(fail);
         }
         check.warn();
+        let failures = check.verdict();
+        if failures.is_err() {
+            let kept =
+                if written.is_empty() { "nothing was kept".into() } else { format!("kept {kept}") };
+            progress::note(&kept);
+            return failures;
+        }
         let mut line = format!(
             "{total} frame{s} in {}, {}",
             output.shown(&written),
@@ -225,6 +238,6 @@ impl Run {
         } else {
             say(&format!("{line}\n"))?;
         }
-        check.verdict()
+        Ok(())
     }
 }

@@ -131,6 +131,9 @@ async fn receive(
         match update {
             None => return Err(Fail::failed("the job ended before its last frame")),
             Some(Err(e)) => return Err(e),
+            Some(Ok(Update::FrameFailed { number, reason })) => {
+                return Err(Fail::failed(format!("frame {number} failed: {reason}")));
+            }
             Some(Ok(Update::Done)) => break,
             Some(Ok(Update::Frame { frame, .. })) => match written {
                 None => frames.push((frame, began.elapsed().as_secs_f64())),

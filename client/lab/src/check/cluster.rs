@@ -164,6 +164,9 @@ pub(crate) async fn embedded_frames<T>(
     while let Some(item) = watch.next().await {
         match item {
             WatchItem::Frame(f) => frames.push(of(&f)?),
+            WatchItem::Failed { number, reason } => {
+                return Err(Fail::failed(format!("frame {number} failed: {reason}")));
+            }
             WatchItem::Notice(view) => {
                 if let JobState::Failed(reason) = view.state {
                     return Err(Fail::failed(reason));

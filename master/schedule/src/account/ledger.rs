@@ -17,8 +17,8 @@ use slabcast_common::ids::WorkerId;
 use slabcast_common::message::{Counters, ErrorsBySource, RegionCost, TaskTimes};
 use slabcast_common::quality::{Quality, Schedule};
 use slabcast_common::stats::{
-    BoundAndEstimate, BrickStats, ErrorStats, Estimate, FrameMs, FrameStats, PoisonedTile,
-    SlabStats, THICKNESS_EXTRAPOLATION, VoxelStats, WorkerStats,
+    BoundAndEstimate, BrickStats, ErrorStats, Estimate, FrameMs, FrameStats, SlabStats,
+    THICKNESS_EXTRAPOLATION, VoxelStats, WorkerStats,
 };
 use std::sync::Arc;
 
@@ -65,7 +65,6 @@ pub(crate) struct Ledger {
     pub(crate) retries: u64,
     pub(crate) handed_over: u64,
     pub(crate) dropped_results: u64,
-    pub(crate) poisoned: Vec<PoisonedTile>,
     path: CriticalPath,
 }
 
@@ -106,7 +105,6 @@ impl Ledger {
             retries: 0,
             handed_over: 0,
             dropped_results: 0,
-            poisoned: Vec::new(),
             path: CriticalPath::default(),
         }
     }
@@ -297,7 +295,8 @@ impl Ledger {
             retries: self.retries,
             handed_over: self.handed_over,
             dropped_results: self.dropped_results,
-            poisoned: self.poisoned,
+            // A frame with a tile missing fails; it has no statistics.
+            poisoned: Vec::new(),
             critical_path: Some(self.path.sentence(now.saturating_sub(self.began), self.cull_us)),
             rehearsed: false,
         };

@@ -89,15 +89,15 @@ impl FrameCore {
         suits: impl Fn(u32) -> bool,
     ) -> Option<u32> {
         let mine = || self.table.places(id).collect();
-        let others = |task: &Task| another_could_have(cluster, task, id);
-        self.table.queue.next_for(id, mine, among, others, suits)
+        let may_try = |task: &Task| may_try(cluster, task, id);
+        self.table.queue.next_for(mine, among, may_try, suits)
     }
 
     /// Returns the first waiting task among a worker's own that it may have.
     fn next_own(&self, cluster: &Cluster, id: WorkerId, own: &[u32]) -> Option<u32> {
         let mine = || self.table.places(id).collect();
-        let others = |task: &Task| another_could_have(cluster, task, id);
-        self.table.queue.next_among(id, mine, own, others)
+        let may_try = |task: &Task| may_try(cluster, task, id);
+        self.table.queue.next_among(mine, own, may_try)
     }
 
     /// Sends a worker the scene and the view of the frame, if it was not sent them.
@@ -448,8 +448,14 @@ impl RegionFrame {
     }
 }
 
-/// Whether an active worker other than `id` could render a task.
-fn another_could_have(cluster: &Cluster, task: &Task, id: WorkerId) -> bool {
-    let refused_it = |id| task.failed.iter().any(|(w, ..)| *w == id);
-    cluster.roster.active().any(|(other, _)| other != id && !refused_it(other))
+/// Whether a worker may try a task that workers failed at: the likeliest do. These are workers that
+/// have not failed at it, and of them those that have drawn something before, since anybody may call
+/// himself a new worker.
+fn may_try(cluster: &Cluster, task: &Task, id: WorkerId) -> bool {
+    let rank = |w: &Worker| match task.was_failed_by(&w.identity) {
+        true => 0,
+        false => 1 + u32::from(w.reputation.has_drawn),
+    };
+    let mine = cluster.roster.get(id).map_or(0, rank);
+    !task.is_choosy() || cluster.roster.active().all(|(_, w)| rank(w) <= mine)
 }

@@ -3,9 +3,10 @@
 use crate::policy::active_set::ActiveSet;
 use crate::policy::cost_history::CostHistory;
 use crate::policy::link_use::LinkUse;
+use crate::state::reputation::Reputations;
 use crate::state::residency::Residency;
 use crate::state::workers::Roster;
-use crate::{Action, Config, Totals};
+use crate::{Action, Config, Micros, Totals};
 use slabcast_common::ids::WorkerId;
 use slabcast_common::message::ToWorker;
 use std::collections::VecDeque;
@@ -15,6 +16,7 @@ use std::collections::VecDeque;
 pub(crate) struct Cluster {
     pub(crate) config: Config,
     pub(crate) roster: Roster,
+    pub(crate) reputations: Reputations,
     pub(crate) residency: Residency,
     pub(crate) history: CostHistory,
     pub(crate) link_use: LinkUse,
@@ -37,6 +39,29 @@ impl Cluster {
             self.out.push_back(Action::Send { worker, message: ToWorker::EndFrame { frame } });
         }
         self.out.push_back(Action::Send { worker, message });
+    }
+
+    /// Activates all workers: a task needs one that has not failed at it.
+    pub(crate) fn activate_all(&mut self) {
+        self.active_set.activate_all();
+        self.roster.activate(usize::MAX);
+    }
+
+    /// Counts a failure of a worker.
+    pub(crate) fn strike(&mut self, id: WorkerId) {
+        if let Some(worker) = self.roster.get_mut(id) {
+            worker.reputation.strike();
+        }
+    }
+
+    /// Has a worker that failed again and again pause.
+    pub(crate) fn pause(&mut self, worker: WorkerId, now: Micros) {
+        let Some(reputation) = self.roster.get(worker).map(|w| w.reputation) else { return };
+        let (failures, pause_us) = (reputation.strikes, reputation.pause_us());
+        if pause_us > 0 {
+            self.roster.pause(worker, now.saturating_add(pause_us));
+            self.out.push_back(Action::Paused { worker, failures, pause_us });
+        }
     }
 
     /// Tells workers which frames are over, if no other message will.

@@ -21,19 +21,21 @@ use crate::account::spans;
 use crate::dispatch::speculate::Pace;
 use crate::policy::macrotile::Cut;
 use crate::state::cluster::Cluster;
+use crate::state::given_up::GivenUp;
 use crate::state::leases::{LeaseTable, Lent};
 use crate::state::region_frame::RegionFrame;
 use crate::state::residency::{ResidencyAction, Transfer};
 use crate::state::result_checks::{check_cost, check_leaves, check_sums};
 use crate::state::slab_frame::SlabFrame;
 use crate::state::task_queue::{End, Task, Verdict};
+use crate::state::workers::Worker;
 use crate::{Action, Clock, FrameJob, Micros, Span};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
 use slabcast_common::image::{FrameState, PixelEncoding};
 use slabcast_common::message::{Pixels, RegionSplit, TileResult, ToWorker};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
-use slabcast_common::stats::{BrickStats, PoisonedTile, SlabStats, TileStats};
+use slabcast_common::stats::{BrickStats, SlabStats, TileStats};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Whether a pixel with accumulated opacity `a` is shut for good.
@@ -104,8 +106,8 @@ pub(crate) struct FrameCore {
     pub(crate) brick_use: BrickUse,
     /// Voxels of all bricks.
     relevant_voxels: u64,
-    any_result: bool,
-    last_reason: String,
+    /// The first tile that was given up.
+    given_up: Option<Box<GivenUp>>,
     pub(crate) ledger: Ledger,
 }
 
@@ -124,8 +126,8 @@ pub(crate) enum Step {
     Waits,
     /// The last phase ended.
     Done,
-    /// The frame can't be rendered; the reason.
-    Failed(String),
+    /// The frame can't be rendered.
+    Failed(Box<GivenUp>),
 }
 
 /// Freedom of one step of a frame, given the other frames in flight.
@@ -171,8 +173,7 @@ impl FrameCore {
             rendered: Vec::new(),
             brick_use: BrickUse::new(job.bricks.len()),
             relevant_voxels: cluster.residency.voxels(job.scene.bricks),
-            any_result: false,
-            last_reason: String::new(),
+            given_up: None,
             ledger,
             job,
         }
@@ -210,7 +211,7 @@ impl FrameCore {
         let tile = |(task, place): (&Task, u32)| {
             let (worker, us) = match &task.end {
                 End::Done { worker, render_us } => (worker.to_string(), *render_us),
-                End::Open | End::Poisoned => (String::new(), 0),
+                End::Open => (String::new(), 0),
             };
             let own = (task.tile.rect, task.tile.est, 0);
             let (rect, est, more) = wholes.get(&place).copied().unwrap_or(own);
@@ -285,44 +286,6 @@ impl FrameCore {
         }
         (leases, running)
     }
-
-    /// Gives tasks up: their pixels stay as the slabs before left them.
-    fn give_up(&mut self, places: Vec<u32>, slab: usize) {
-        for place in places {
-            let table = &mut self.table;
-            table.queue.finish(place, End::Poisoned);
-            let task = &table.queue.tasks[place as usize];
-            let rect = task.tile.rect;
-            let mut workers: Vec<String> = task.blamed.iter().map(|(_, n)| n.clone()).collect();
-            workers.extend(task.failed.iter().map(|(_, n, _)| n.clone()));
-            let mut reasons: Vec<String> = Vec::new();
-            if !task.blamed.is_empty() {
-                reasons.push(format!("{} workers were lost with it", task.blamed.len()));
-            }
-            reasons.extend(task.failed.iter().map(|(_, n, reason)| format!("{n}: {reason}")));
-            let reason = reasons.join("; ");
-            self.ledger.poisoned.push(PoisonedTile {
-                slab: slab as u32,
-                x: rect.x0 as u32,
-                y: rect.y0 as u32,
-                size: table.cut.edge_of(&rect),
-                workers: workers.clone(),
-            });
-            self.ledger.spans.push(Span {
-                name: format!("{},{} given up", rect.x0, rect.y0),
-                category: "tile",
-                worker: None,
-                thread: 0,
-                start: self.phase_began,
-                end: self.phase_began,
-                args: vec![("workers", workers.join(", ")), ("reason", reason.clone())],
-            });
-            self.last_reason = format!(
-                "no tile could be rendered; tile {},{} of slab {slab}: {reason}",
-                rect.x0, rect.y0,
-            );
-        }
-    }
 }
 
 impl Frame {
@@ -394,6 +357,10 @@ impl Frame {
             let core = self.core();
             match core.stage {
                 Stage::Done => return Step::Done,
+                Stage::Drawing if core.given_up.is_some() => {
+                    let given_up = self.core_mut().given_up.take();
+                    return Step::Failed(given_up.expect("just seen"));
+                }
                 Stage::Drawing if core.table.queue.open() > 0 => {
                     match self {
                         Frame::Slab(frame) => frame.dispatch(cluster, context, clock.now()),
@@ -401,17 +368,10 @@ impl Frame {
                     }
                     return Step::Waits;
                 }
-                Stage::Drawing => {
-                    let tried = !core.table.queue.tasks.is_empty();
-                    match self {
-                        Frame::Slab(frame) => frame.end_slab(cluster, clock.now()),
-                        Frame::Region(frame) => frame.end_regions(clock.now()),
-                    }
-                    let core = self.core_mut();
-                    if tried && !core.any_result {
-                        return Step::Failed(std::mem::take(&mut core.last_reason));
-                    }
-                }
+                Stage::Drawing => match self {
+                    Frame::Slab(frame) => frame.end_slab(cluster, clock.now()),
+                    Frame::Region(frame) => frame.end_regions(clock.now()),
+                },
                 // How a frame is cut depends on the number of threads.
                 Stage::Waiting if cluster.roster.threads() == 0 => return Step::Waits,
                 Stage::Waiting => {
@@ -448,7 +408,7 @@ impl Frame {
         clock: &dyn Clock,
     ) -> Result<Option<(Micros, Micros)>, String> {
         let now = clock.now();
-        let (slab, _) = self.slab();
+        let slab = self.slab().0;
         let by_region = self.as_region().is_some();
         let core = self.core_mut();
         let before = core.table.note_answer(worker, now);
@@ -474,9 +434,7 @@ impl Frame {
         let bricks = core.job.bricks.len();
         if let Err(lie) = checked.and_then(|()| check_cost(cost, tile, bricks)) {
             // Its other leases go back when it is dropped; this one it has just answered.
-            let lease = [(place, result.epoch)];
-            let given_up = core.table.queue.lose(worker, "", &lease, 0, &cluster.config);
-            core.give_up(given_up, slab);
+            core.table.queue.release(place, worker, result.epoch);
             return Err(lie);
         }
         let rendered = place_in_time(who, &result.times, lease.sent, now);
@@ -486,7 +444,6 @@ impl Frame {
         let est = core.table.cut.tiles[place as usize].est;
         let lasted = now.saturating_sub(lease.sent.max(before));
         core.pace.note(est, end - start, lasted);
-        core.any_result = true;
         core.ledger.add_result_bytes(result.bytes);
         core.ledger.add_rendering(worker, &rendered, &result.counters);
         core.rendered.push(RenderedTile {
@@ -553,18 +510,16 @@ impl Frame {
         task: TaskId,
         epoch: Epoch,
         reason: String,
+        now: Micros,
     ) {
-        let (slab, _) = self.slab();
         let core = self.core_mut();
         if core.take_answered(cluster, worker, task, epoch).is_none() {
             return;
         }
         let verdict = core.table.queue.judge(task, epoch, worker);
         let Verdict::Counts(place, _) = verdict else { return };
-        let name = cluster.roster.get(worker).map_or("", |w| &w.name);
-        let queue = &mut core.table.queue;
-        let given_up = queue.fail(place, epoch, worker, name, reason, &cluster.config);
-        core.give_up(given_up, slab);
+        let Some(who) = cluster.roster.get(worker).map(|w| &w.identity) else { return };
+        core.table.queue.fail(place, epoch, worker, who, reason, now);
         if let Some(region) = self.as_region_mut() {
             region.splits.forget_question(place);
         }
@@ -618,12 +573,11 @@ impl Frame {
         &mut self,
         cluster: &mut Cluster,
         id: WorkerId,
-        worker: &crate::state::workers::Worker,
+        worker: &Worker,
         blame: bool,
         threads: u32,
         now: Micros,
     ) {
-        let (slab, _) = self.slab();
         if let Some(region) = self.as_region_mut() {
             region.splits.forget_worker(id);
         }
@@ -639,9 +593,7 @@ impl Frame {
         core.ledger.close_account(id, now);
         if core.stage == Stage::Drawing {
             let running = if blame { running } else { 0 };
-            let queue = &mut core.table.queue;
-            let given_up = queue.lose(id, &worker.name, &leases, running, &cluster.config);
-            core.give_up(given_up, slab);
+            core.table.queue.lose(id, &worker.identity, &leases, running, now);
         }
     }
 
@@ -650,9 +602,34 @@ impl Frame {
         self.core_mut().ledger.transfer_ended(id, transfer, now);
     }
 
-    /// Requeues tasks whose leases expired.
-    pub(crate) fn tick(&mut self, now: Micros) {
-        self.core_mut().table.queue.requeue_overdue(now);
+    /// Requeues tasks whose leases expired or whose pause is over, and gives up those that no
+    /// linked worker can draw.
+    pub(crate) fn tick(&mut self, cluster: &mut Cluster, now: Micros) {
+        let (slab, _) = self.slab();
+        let core = self.core_mut();
+        let queue = &mut core.table.queue;
+        queue.requeue_overdue(now);
+        queue.end_pauses(now);
+        if core.stage != Stage::Drawing {
+            return;
+        }
+        let troubled: Vec<u32> = core.table.queue.troubled().collect();
+        for place in troubled {
+            let is_hopeless = {
+                let linked = cluster.roster.iter().filter(|(_, w)| !w.leaving);
+                let linked = linked.map(|(_, w)| &*w.identity);
+                core.table.queue.hopeless(place, linked, &cluster.config)
+            };
+            if is_hopeless && core.given_up.is_none() {
+                core.given_up = Some(Box::new(GivenUp::new(&core.table, place, slab)));
+            }
+            let task = &core.table.queue.tasks[place as usize];
+            let is_fresh = |w: &Worker| !task.was_failed_by(&w.identity);
+            if cluster.roster.in_reserve() > 0 && !cluster.roster.active().any(|(_, w)| is_fresh(w))
+            {
+                cluster.activate_all();
+            }
+        }
     }
 
     /// Returns the next time at which the frame has something to do; `None` once it is done.
@@ -753,6 +730,7 @@ pub(crate) fn send_bricks(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::state::workers::Newcomer;
 
     #[test]
     fn pixel_is_shut_below_eps_and_not_at_it() {
@@ -766,7 +744,8 @@ mod tests {
     #[test]
     fn task_times_of_a_wrong_clock_stay_between_lease_and_arrival() {
         let mut roster = crate::state::workers::Roster::default();
-        roster.join(WorkerId(1), "mad".into(), 1, false, 0);
+        let mad = Newcomer { name: "mad".into(), threads: 1, ..Newcomer::default() };
+        roster.join(WorkerId(1), mad, 0);
         let worker = roster.get(WorkerId(1)).expect("it joined");
         for (start_us, end_us) in [(0, u64::MAX), (u64::MAX, 0), (5, 6), (7, 7)] {
             let times = slabcast_common::message::TaskTimes {

@@ -3,9 +3,11 @@
 
 pub(crate) mod cluster;
 pub(crate) mod frame;
+pub(crate) mod given_up;
 pub(crate) mod leases;
 pub(crate) mod region_frame;
 pub(crate) mod region_tiles;
+pub(crate) mod reputation;
 pub(crate) mod residency;
 pub(crate) mod result_checks;
 pub(crate) mod slab_frame;

@@ -11,17 +11,28 @@
 //! together. So a suspect is never lent to a worker that has another, and when a worker is lost
 //! with a suspect on it, only those blamed most before are blamed again.
 //!
-//! A cluster may also lose workers for reasons of its own (docs/design/promises.md R1 kills 7 of 8
-//! in one frame): a tile that three of them happened to hold is innocent. A deadly tile is held by
-//! every worker that is lost. So each loss that a tile has an alibi for asks for one more witness
-//! against it, up to twice as many.
+//! **When is a task given up?** Never while a worker is linked that has not failed at it. Workers are
+//! told apart by what they are over all their links ([`WorkerIdentity`]), so that one that comes back
+//! after each crash counts once. Between tries of a task there are pauses, each twice as long as the
+//! one before: whatever makes workers fail may pass, and a better worker may come. Only when every
+//! linked worker has failed at a task, and it was tried often enough, its frame fails
+//! ([`TaskQueue::hopeless`]).
 
 use crate::policy::macrotile::Macrotile;
-use crate::{Config, Micros};
+use crate::{Config, Micros, WorkerIdentity};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
 use slabcast_common::message::Checkpoint;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+
+/// Limit: pause before the third try of a task, in microseconds. The second try follows at once: most
+/// losses have nothing to do with a task. Later pauses are twice as long each, up to the longest.
+const FIRST_PAUSE_US: Micros = 100_000;
+const LONGEST_PAUSE_US: Micros = 2_000_000;
+
+/// Limit: time in microseconds for which a task that workers failed at waits for the workers that
+/// are likeliest to draw it. Then any worker may try, lest it waits for one that hangs.
+const CHOOSY_US: Micros = 5_000_000;
 
 /// A live lease: its result would count.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -40,8 +51,16 @@ pub(crate) enum End {
     Open,
     /// Rendered.
     Done { worker: Arc<str>, render_us: Micros },
-    /// Given up.
-    Poisoned,
+}
+
+/// A worker that failed at a task.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Failure {
+    pub(crate) who: Arc<WorkerIdentity>,
+    /// How often.
+    pub(crate) times: u32,
+    /// What it said last when it refused the task; `None`: it was lost with it.
+    pub(crate) said: Option<String>,
 }
 
 /// One tile to render.
@@ -53,10 +72,12 @@ pub(crate) struct Task {
     attempts: u32,
     /// Key in the queue's order while the task waits.
     queued: Option<i64>,
-    /// Lost workers that were probably running it: id and name.
-    pub(crate) blamed: Vec<(WorkerId, String)>,
-    /// Workers that refused it: id, name and reason.
-    pub(crate) failed: Vec<(WorkerId, String, String)>,
+    /// Workers that were lost with it or refused it, each once.
+    pub(crate) failures: Vec<Failure>,
+    /// How often a worker was lost that was probably running it.
+    blamed: u32,
+    /// While it waits after a failure: until when only the likeliest workers may try it.
+    choosy_until: Option<Micros>,
     /// State in which another worker gave the piece away; `None`: it starts from nothing.
     pub(crate) begun: Option<Arc<Checkpoint>>,
 }
@@ -69,18 +90,16 @@ impl Task {
             leases: Vec::new(),
             attempts: 0,
             queued: Some(order),
-            blamed: Vec::new(),
-            failed: Vec::new(),
+            failures: Vec::new(),
+            blamed: 0,
+            choosy_until: None,
             begun: None,
         }
     }
 
     /// Whether a speculative copy may be made: one worker has it, none was lost with it.
     pub(crate) fn may_speculate(&self) -> bool {
-        self.leases.len() == 1
-            && self.queued.is_none()
-            && !self.is_suspect()
-            && self.failed.is_empty()
+        self.leases.len() == 1 && self.queued.is_none() && self.failures.is_empty()
     }
 
     /// Whether any worker was lent it.
@@ -89,7 +108,32 @@ impl Task {
     }
 
     fn is_suspect(&self) -> bool {
-        !self.blamed.is_empty()
+        self.blamed > 0
+    }
+
+    /// How often a worker failed at it.
+    pub(crate) fn tries(&self) -> u32 {
+        self.failures.iter().fold(0, |sum, f| sum.saturating_add(f.times))
+    }
+
+    /// Whether a worker failed at it, on this link or an earlier one.
+    pub(crate) fn was_failed_by(&self, who: &WorkerIdentity) -> bool {
+        self.failures.iter().any(|f| *f.who == *who)
+    }
+
+    /// Whether only the likeliest of the workers may try it now.
+    pub(crate) fn is_choosy(&self) -> bool {
+        self.choosy_until.is_some()
+    }
+
+    fn add_failure(&mut self, who: &Arc<WorkerIdentity>, said: Option<String>) {
+        match self.failures.iter_mut().find(|f| f.who == *who) {
+            Some(failure) => {
+                failure.times = failure.times.saturating_add(1);
+                failure.said = said.or(failure.said.take());
+            }
+            None => self.failures.push(Failure { who: who.clone(), times: 1, said }),
+        }
     }
 }
 
@@ -112,9 +156,11 @@ pub(crate) struct TaskQueue {
     /// Key of the next task that is put in front of all.
     front: i64,
     deadlines: BTreeSet<(Micros, u32, Epoch)>,
+    /// Tasks that are not lent before a time, after failures.
+    paused: BTreeSet<(Micros, u32)>,
+    /// Open tasks that workers failed at.
+    troubled: BTreeSet<u32>,
     open: u32,
-    /// Workers lost meanwhile that a task may have killed.
-    losses: usize,
     /// Leases beyond the first of a task.
     pub(crate) retries: u64,
 }
@@ -130,7 +176,8 @@ impl TaskQueue {
             front: -1,
             deadlines: BTreeSet::new(),
             open: tiles.len() as u32,
-            losses: 0,
+            paused: BTreeSet::new(),
+            troubled: BTreeSet::new(),
             retries: 0,
         }
     }
@@ -198,27 +245,25 @@ impl TaskQueue {
         (place < self.tasks.len() as u64).then_some(place as u32)
     }
 
-    /// Returns the first waiting task with `among` and `suits` that the worker may have. `mine`:
-    /// tasks it has leases of. `others`: whether another worker could have the task.
+    /// Returns the first waiting task with `among` and `suits` that a worker may have. `mine`: tasks
+    /// it has leases of. `may_try`: whether it may try a task that workers failed at.
     pub(crate) fn next_for(
         &self,
-        worker: WorkerId,
         mine: impl Fn() -> Vec<u32>,
         among: impl Fn(u32) -> bool,
-        others: impl Fn(&Task) -> bool,
+        may_try: impl Fn(&Task) -> bool,
         suits: impl Fn(u32) -> bool,
     ) -> Option<u32> {
-        let fits = self.fits(worker, mine, others);
+        let fits = self.fits(mine, may_try);
         self.waiting.values().copied().find(|&place| among(place) && fits(place) && suits(place))
     }
 
-    /// Returns a test for whether a worker may have a task: not one it has, not one it refused
-    /// unless nobody else could have it, and no second suspect.
+    /// Returns a test for whether a worker may have a task: not one it has, not one that it may not
+    /// try, and no second suspect.
     fn fits(
         &self,
-        worker: WorkerId,
         mine: impl Fn() -> Vec<u32>,
-        others: impl Fn(&Task) -> bool,
+        may_try: impl Fn(&Task) -> bool,
     ) -> impl Fn(u32) -> bool {
         move |place| {
             let task = &self.tasks[place as usize];
@@ -229,9 +274,8 @@ impl TaskQueue {
             let mine = mine();
             let has_suspect = mine.iter().any(|&p| self.tasks[p as usize].is_suspect());
             let has_it = mine.contains(&place);
-            let failed = task.failed.iter().any(|(w, ..)| *w == worker) && others(task);
             let two_suspects = has_suspect && task.is_suspect();
-            !(has_it || failed || two_suspects)
+            !(has_it || two_suspects) && (task.failures.is_empty() || may_try(task))
         }
     }
 
@@ -239,12 +283,11 @@ impl TaskQueue {
     /// [`Self::next_for`] for a worker with a list of its own.
     pub(crate) fn next_among(
         &self,
-        worker: WorkerId,
         mine: impl Fn() -> Vec<u32>,
         places: &[u32],
-        others: impl Fn(&Task) -> bool,
+        may_try: impl Fn(&Task) -> bool,
     ) -> Option<u32> {
-        let fits = self.fits(worker, mine, others);
+        let fits = self.fits(mine, may_try);
         let waits = |&place: &u32| Some((self.tasks[place as usize].queued?, place));
         let may = places.iter().filter_map(waits).filter(|&(_, place)| fits(place));
         may.min().map(|(_, place)| place)
@@ -260,6 +303,7 @@ impl TaskQueue {
     ) -> Epoch {
         let task = &mut self.tasks[place as usize];
         let order = task.queued.take().expect("only a waiting task is lent");
+        task.choosy_until = None;
         self.waiting.remove(&order);
         self.add_lease(place, worker, now, config)
     }
@@ -311,6 +355,9 @@ impl TaskQueue {
         if let Some(order) = task.queued.take() {
             self.waiting.remove(&order);
         }
+        if self.troubled.remove(&place) {
+            self.paused.retain(|(_, paused)| *paused != place);
+        }
     }
 
     /// Ends one lease without a result.
@@ -336,67 +383,104 @@ impl TaskQueue {
     }
 
     /// Takes back the leases of a lost worker, given in the order in which it got them. The first
-    /// `running` of them are blamed. Returns the tasks that are given up for it.
+    /// `running` of them are blamed.
     pub(crate) fn lose(
         &mut self,
         worker: WorkerId,
-        name: &str,
+        who: &Arc<WorkerIdentity>,
         leases: &[(u32, Epoch)],
         running: usize,
-        config: &Config,
-    ) -> Vec<u32> {
+        now: Micros,
+    ) {
         let mut head: Vec<u32> = leases.iter().take(running).map(|l| l.0).collect();
         head.retain(|&p| self.tasks[p as usize].end == End::Open);
-        let most = head.iter().map(|&p| self.tasks[p as usize].blamed.len()).max().unwrap_or(0);
-        self.losses += usize::from(!head.is_empty());
+        let most = head.iter().map(|&p| self.tasks[p as usize].blamed).max().unwrap_or(0);
         for &place in &head {
             let task = &mut self.tasks[place as usize];
-            if task.blamed.len() == most {
-                task.blamed.push((worker, name.to_owned()));
+            if task.blamed == most {
+                task.blamed = task.blamed.saturating_add(1);
+                task.add_failure(who, None);
+                self.troubled.insert(place);
             }
         }
-        self.take_back(worker, leases, config)
+        self.take_back(worker, leases, now);
     }
 
-    /// Takes back a task that a worker refused. Returns it if it is given up.
+    /// Takes back a task that a worker refused, for `reason`.
     pub(crate) fn fail(
         &mut self,
         place: u32,
         epoch: Epoch,
         worker: WorkerId,
-        name: &str,
+        who: &Arc<WorkerIdentity>,
         reason: String,
-        config: &Config,
-    ) -> Vec<u32> {
-        self.tasks[place as usize].failed.push((worker, name.to_owned(), reason));
-        self.take_back(worker, &[(place, epoch)], config)
+        now: Micros,
+    ) {
+        self.tasks[place as usize].add_failure(who, Some(reason));
+        self.troubled.insert(place);
+        self.take_back(worker, &[(place, epoch)], now);
     }
 
-    /// Ends leases and puts their tasks in front in their old order. A task with another live lease
-    /// goes on with that one; one without, that was blamed or refused often enough, is returned to
-    /// be given up.
-    fn take_back(
-        &mut self,
-        worker: WorkerId,
-        leases: &[(u32, Epoch)],
-        config: &Config,
-    ) -> Vec<u32> {
-        let mut given_up = Vec::new();
+    /// Ends leases and puts their tasks in front in their old order; those that workers failed at
+    /// more than once only after a pause. A task with another live lease goes on with that one.
+    fn take_back(&mut self, worker: WorkerId, leases: &[(u32, Epoch)], now: Micros) {
         for &(place, epoch) in leases.iter().rev() {
             self.end_lease(place, worker, epoch);
-            let task = &self.tasks[place as usize];
-            if task.end != End::Open || !task.leases.is_empty() {
+            let task = &mut self.tasks[place as usize];
+            if task.end != End::Open || !task.leases.is_empty() || task.queued.is_some() {
                 continue;
             }
-            let limit = config.poison_after.max(1) as usize;
-            let alibis = self.losses.saturating_sub(task.blamed.len()).min(limit);
-            if task.blamed.len() >= limit + alibis || task.failed.len() >= limit {
-                given_up.push(place);
-            } else {
-                self.requeue(place);
+            let tries = task.tries();
+            if tries > 0 {
+                let doubled = FIRST_PAUSE_US << tries.saturating_sub(2).min(20);
+                let pause = if tries == 1 { 0 } else { doubled.min(LONGEST_PAUSE_US) };
+                task.choosy_until = Some(now.saturating_add(pause).saturating_add(CHOOSY_US));
+                if pause > 0 {
+                    self.paused.insert((now.saturating_add(pause), place));
+                    continue;
+                }
             }
+            self.requeue(place);
         }
-        given_up
+    }
+
+    /// Queues tasks whose pause is over, and lets any worker try those that have waited for the
+    /// likeliest for long.
+    pub(crate) fn end_pauses(&mut self, now: Micros) {
+        while let Some(&(until, place)) = self.paused.first()
+            && until <= now
+        {
+            self.paused.pop_first();
+            self.requeue(place);
+        }
+        for place in &self.troubled {
+            let task = &mut self.tasks[*place as usize];
+            task.choosy_until = task.choosy_until.filter(|until| now < *until);
+        }
+    }
+
+    /// Returns the open tasks that workers failed at and nobody has now.
+    pub(crate) fn troubled(&self) -> impl Iterator<Item = u32> {
+        let is_free = |place: &u32| self.tasks[*place as usize].leases.is_empty();
+        self.troubled.iter().copied().filter(is_free)
+    }
+
+    /// Whether a task is given up: every one of the linked workers failed at it, and it was tried
+    /// at least twice as often as the rule asks for workers, or four times as often by fewer.
+    /// False while no worker is linked.
+    pub(crate) fn hopeless<'a>(
+        &self,
+        place: u32,
+        mut linked: impl Iterator<Item = &'a WorkerIdentity>,
+        config: &Config,
+    ) -> bool {
+        let task = &self.tasks[place as usize];
+        let (workers, limit) = (task.failures.len(), config.poison_after.max(1));
+        let factor = if workers >= limit as usize { 2 } else { 4 };
+        let Some(first) = linked.next() else { return false };
+        task.tries() >= limit.saturating_mul(factor)
+            && task.was_failed_by(first)
+            && linked.all(|who| task.was_failed_by(who))
     }
 
     /// Requeues tasks that a leaving worker has not begun; its leases stay live.
@@ -420,9 +504,11 @@ impl TaskQueue {
         }
     }
 
-    /// Returns the next lease deadline.
+    /// Returns the next time at which a lease ends, a pause is over or any worker may try a task.
     pub(crate) fn next_deadline(&self) -> Option<Micros> {
-        self.deadlines.first().map(|d| d.0)
+        let choosy = self.troubled.iter().filter_map(|p| self.tasks[*p as usize].choosy_until);
+        let first = [self.deadlines.first().map(|d| d.0), self.paused.first().map(|p| p.0)];
+        first.into_iter().flatten().chain(choosy).min()
     }
 }
 
@@ -437,12 +523,21 @@ mod tests {
         TaskQueue::new(TaskId(10), &tiles)
     }
 
-    fn next(q: &TaskQueue, w: u64, mine: &[u32]) -> Option<u32> {
-        q.next_for(WorkerId(w), || mine.to_vec(), |_| true, |_| true, |_| true)
+    fn next(q: &TaskQueue, mine: &[u32]) -> Option<u32> {
+        q.next_for(|| mine.to_vec(), |_| true, |_| true, |_| true)
+    }
+
+    fn who(name: &str) -> Arc<WorkerIdentity> {
+        Arc::new(WorkerIdentity { host: "here".into(), name: name.into() })
+    }
+
+    /// Loses a worker at a time, with leases of which it ran so many.
+    fn lose(q: &mut TaskQueue, w: u64, leases: &[(u32, Epoch)], running: usize, now: Micros) {
+        q.lose(WorkerId(w), &who(&format!("w{w}")), leases, running, now);
     }
 
     fn take(q: &mut TaskQueue, w: u64, mine: &[u32], now: Micros) -> (u32, Epoch) {
-        let place = next(q, w, mine).expect("something waits");
+        let place = next(q, mine).expect("something waits");
         (place, q.lease(place, WorkerId(w), now, &Config::default()))
     }
 
@@ -452,14 +547,13 @@ mod tests {
 
     #[test]
     fn queue_lends_returned_tasks_first_then_the_largest() {
-        let c = Config::default();
         let mut q = queue(4);
         assert_eq!(take(&mut q, 1, &[], 0), (0, Epoch(0)));
         assert_eq!(take(&mut q, 1, &[0], 0), (1, Epoch(0)));
         assert_eq!(take(&mut q, 2, &[], 0), (2, Epoch(0)));
-        assert!(q.lose(WorkerId(1), "one", &[(0, Epoch(0)), (1, Epoch(0))], 1, &c).is_empty());
-        assert_eq!(q.tasks[0].blamed.len(), 1);
-        assert_eq!(q.tasks[1].blamed.len(), 0, "it was not running yet");
+        lose(&mut q, 1, &[(0, Epoch(0)), (1, Epoch(0))], 1, 0);
+        assert_eq!(q.tasks[0].tries(), 1);
+        assert_eq!(q.tasks[1].tries(), 0, "it was not running yet");
         assert_eq!(take(&mut q, 3, &[], 0), (0, Epoch(1)));
         assert_eq!(take(&mut q, 3, &[0], 0), (1, Epoch(1)));
         assert_eq!(take(&mut q, 3, &[0, 1], 0), (3, Epoch(0)));
@@ -477,8 +571,8 @@ mod tests {
         let mut q = queue(6);
         let same = |q: &TaskQueue, own: &[u32], mine: &[u32]| {
             let mine = || mine.to_vec();
-            let all = q.next_for(WorkerId(1), mine, |p| own.contains(&p), |_| true, |_| true);
-            assert_eq!(q.next_among(WorkerId(1), mine, own, |_| true), all);
+            let all = q.next_for(mine, |p| own.contains(&p), |_| true, |_| true);
+            assert_eq!(q.next_among(mine, own, |_| true), all);
             assert_eq!(q.any_waiting(own), own.iter().any(|p| q.all_waiting().any(|w| w == *p)));
             all
         };
@@ -488,7 +582,7 @@ mod tests {
         assert_eq!(same(&q, &[5, 2, 4], &[2]), Some(4));
         assert_eq!(same(&q, &[5, 2], &[2]), None);
         // What comes back is before all others, the last one first.
-        q.lose(WorkerId(2), "two", &[(5, Epoch(0))], 0, &c);
+        lose(&mut q, 2, &[(5, Epoch(0))], 0, 0);
         q.share_queued(&[2]);
         assert_eq!(q.all_waiting().collect::<Vec<_>>(), [2, 5, 0, 1, 3, 4]);
         assert_eq!(same(&q, &[4, 2, 5], &[2]), Some(5), "it has the first");
@@ -503,7 +597,7 @@ mod tests {
         take(&mut q, 1, &[], 0);
         assert_eq!(q.next_deadline(), Some(c.lease));
         q.requeue_overdue(c.lease);
-        assert_eq!(next(&q, 1, &[0]), None, "another worker, not the same");
+        assert_eq!(next(&q, &[0]), None, "another worker, not the same");
         assert_eq!(take(&mut q, 2, &[], c.lease), (0, Epoch(1)));
         assert_eq!(q.next_deadline(), Some(c.lease + 2 * c.lease), "doubled");
         assert!(matches!(q.judge(TaskId(10), Epoch(0), WorkerId(1)), Verdict::Counts(..)));
@@ -527,70 +621,73 @@ mod tests {
     }
 
     #[test]
-    fn task_that_three_workers_die_with_is_given_up() {
-        let c = Config::default();
-        let mut q = queue(2);
-        for w in 1..=3 {
-            let lease = take(&mut q, w, &[], 0);
-            assert_eq!(lease.0, 0);
-            let given_up = q.lose(WorkerId(w), "x", &[lease], 4, &c);
-            assert_eq!(given_up, if w == 3 { vec![0] } else { vec![] });
+    fn pauses_between_tries_of_a_task_grow() {
+        let mut q = queue(1);
+        let (mut now, mut pauses) = (0, Vec::new());
+        for w in 1..=8 {
+            let lease = take(&mut q, w, &[], now);
+            lose(&mut q, w, &[lease], 1, now);
+            let lost = now;
+            while next(&q, &[]).is_none() {
+                now = q.next_deadline().expect("the end of its pause");
+                q.end_pauses(now);
+            }
+            pauses.push((now - lost) / 1000);
         }
+        assert_eq!(pauses, [0, 100, 200, 400, 800, 1600, 2000, 2000]);
+    }
+
+    #[test]
+    fn one_worker_that_crashes_again_and_again_is_one_witness() {
+        let c = Config::default();
+        let mut q = queue(1);
+        let (crashes, fresh) = (who("crashes"), who("fresh"));
+        for link in 1..=12 {
+            let both = || [&*crashes, &*fresh].into_iter();
+            assert!(!q.hopeless(0, [&*crashes].into_iter(), &c), "after {} tries", link - 1);
+            q.end_pauses(1000 * LONGEST_PAUSE_US);
+            let (place, epoch) = take(&mut q, link, &[], 0);
+            q.lose(WorkerId(link), &crashes, &[(place, epoch)], 1, 0);
+            assert!(!q.hopeless(0, both(), &c), "a fresh worker has not tried");
+            assert!(!q.hopeless(0, std::iter::empty(), &c), "nobody is there to try");
+        }
+        assert_eq!(q.tasks[0].failures.len(), 1);
+        assert!(q.hopeless(0, [&*crashes].into_iter(), &c));
+    }
+
+    #[test]
+    fn task_is_hopeless_once_all_linked_workers_failed_at_it_twice() {
+        let c = Config::default();
+        let mut q = queue(1);
+        let names = ["a", "b", "c"].map(who);
+        for round in 0..2 {
+            for (name, w) in names.iter().zip(1..) {
+                assert!(!q.hopeless(0, names.iter().map(|n| &**n), &c), "round {round}");
+                q.end_pauses(1000 * LONGEST_PAUSE_US);
+                let (place, epoch) = take(&mut q, w, &[], 0);
+                q.fail(place, epoch, WorkerId(w), name, "no".into(), 0);
+            }
+        }
+        assert!(q.hopeless(0, names.iter().map(|n| &**n), &c));
+        assert!(!q.hopeless(0, [&*who("d")].into_iter(), &c), "it may do better");
+        assert_eq!(q.troubled().collect::<Vec<_>>(), [0]);
+        q.finish(0, done());
+        assert_eq!((q.troubled().count(), q.next_deadline()), (0, None));
     }
 
     #[test]
     fn poison_blame_spares_the_neighbour_of_a_deadly_task() {
         // Workers of two threads; task 0 kills whoever runs it, tasks 1 and up are harmless.
-        let c = Config::default();
         let mut q = queue(6);
-        let mut given_up = Vec::new();
-        for w in 1..=3 {
+        for w in 1..=6 {
+            q.end_pauses(1000 * LONGEST_PAUSE_US);
             let a = take(&mut q, w, &[], 0);
             let b = take(&mut q, w, &[a.0], 0);
             assert_eq!(a.0, 0);
             assert!(!(q.tasks[a.0 as usize].is_suspect() && q.tasks[b.0 as usize].is_suspect()));
-            given_up = q.lose(WorkerId(w), "x", &[a, b], 2, &c);
+            lose(&mut q, w, &[a, b], 2, 0);
         }
-        assert_eq!(given_up, [0]);
-        assert!(q.tasks[1..].iter().all(|t| t.blamed.len() <= 1));
-    }
-
-    #[test]
-    fn poison_needs_more_losses_where_workers_die_anyway() {
-        let c = Config::default();
-        let mut q = queue(3);
-        // A loss that task 0 has nothing to do with: it is with worker 1 meanwhile.
-        let mut held = take(&mut q, 1, &[], 0);
-        let other = take(&mut q, 9, &[], 0);
-        assert!(q.lose(WorkerId(9), "x", &[other], 1, &c).is_empty());
-        q.lease(other.0, WorkerId(10), 0, &c);
-        for w in 1..=4 {
-            assert_eq!(held.0, 0);
-            let given_up = q.lose(WorkerId(w), "x", &[held], 1, &c);
-            // Three, and one for the other loss.
-            assert_eq!(given_up, if w == 4 { vec![0] } else { vec![] });
-            if w < 4 {
-                held = take(&mut q, w + 1, &[], 0);
-            }
-        }
-    }
-
-    #[test]
-    fn task_refused_three_times_is_given_up() {
-        let c = Config::default();
-        let mut q = queue(1);
-        for w in [1, 1, 2] {
-            assert_eq!(q.open(), 1);
-            // Worker 1 gets it again only while there is nobody else.
-            let alone = w == 1;
-            assert_eq!(
-                q.next_for(WorkerId(1), Vec::new, |_| true, |_| true, |_| true).is_none(),
-                !q.tasks[0].failed.is_empty(),
-            );
-            let place = q.next_for(WorkerId(w), Vec::new, |_| true, |_| !alone, |_| true).unwrap();
-            let epoch = q.lease(place, WorkerId(w), 0, &c);
-            let given_up = q.fail(0, epoch, WorkerId(w), "x", "no".into(), &c);
-            assert_eq!(given_up.len(), usize::from(w == 2));
-        }
+        assert_eq!(q.tasks[0].tries(), 6);
+        assert!(q.tasks[1..].iter().all(|t| t.tries() <= 1));
     }
 }

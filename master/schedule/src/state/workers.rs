@@ -8,14 +8,17 @@
 //! | silence | anything heard | `silence` | the worker is lost |
 //! | lease (`task_queue`) | task leased | `lease` * 2^attempt | another worker gets it too |
 //! | speculation (`speculate`) | task leased | twice its estimate | an idle worker gets a copy |
+//! | a task's pause (`task_queue`) | workers failed at it | 0.1 s, doubled, to 2 s | it is lent again |
+//! | a worker's pause (`reputation`) | it failed twice or more | 0.25 s, doubled, to 10 s | it is lent tasks again |
 //!
 //! **Silence is judged on a clock that was watched.** If the driver itself did not run for a while
 //! (the process was stopped, the machine slept), every worker looks silent while its messages wait
 //! in a socket. So when the time between two events is longer than two heartbeats, which can't
 //! happen to a driver that keeps `next_deadline`, the excess is added to everybody's account.
 
+use crate::state::reputation::Reputation;
 use crate::state::worker_map::WorkerMap;
-use crate::{Config, Micros};
+use crate::{Config, Micros, WorkerIdentity};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, SceneId, WorkerId};
 use slabcast_common::message::DIRECTORIES_KEPT;
@@ -36,10 +39,23 @@ const MAX_PINGS: usize = 1024;
 /// Limit: lanes of workers that render overlapping frames in turn.
 pub(crate) const LANES: u32 = 2;
 
+/// A worker that joins.
+#[derive(Debug, Default)]
+pub(crate) struct Newcomer {
+    pub(crate) name: String,
+    pub(crate) identity: Arc<WorkerIdentity>,
+    pub(crate) reputation: Reputation,
+    pub(crate) threads: u32,
+    pub(crate) is_local: bool,
+}
+
 /// One worker.
 #[derive(Debug)]
 pub(crate) struct Worker {
     pub(crate) name: Arc<str>,
+    /// What it is over all its links.
+    pub(crate) identity: Arc<WorkerIdentity>,
+    pub(crate) reputation: Reputation,
     pub(crate) threads: u32,
     /// Whether the worker runs on the master's host.
     pub(crate) is_local: bool,
@@ -48,6 +64,8 @@ pub(crate) struct Worker {
     pub(crate) leaving: bool,
     /// The worker is outside the active set (`policy::active_set`) and takes no leases for now.
     is_spare: bool,
+    /// The worker takes no leases before this time, since it failed again and again.
+    paused_until: Option<Micros>,
     /// Scenes that were sent to it.
     pub(crate) scenes: BTreeSet<SceneId>,
     /// Leases of frames in flight that it has not answered.
@@ -87,7 +105,7 @@ impl Worker {
 
     /// Whether the worker is active: it takes leases.
     pub(crate) fn is_active(&self) -> bool {
-        !self.leaving && !self.is_spare
+        !self.leaving && !self.is_spare && self.paused_until.is_none()
     }
 
     /// Whether a render thread has no lease.
@@ -144,21 +162,29 @@ impl Default for Roster {
 }
 
 impl Roster {
-    pub(crate) fn join(
-        &mut self,
-        id: WorkerId,
-        name: String,
-        threads: u32,
-        is_local: bool,
-        now: Micros,
-    ) {
+    /// Returns an identity that no linked worker has: `wanted`, or another worker of its machine
+    /// that shares its name.
+    pub(crate) fn free_identity(&self, wanted: WorkerIdentity) -> Arc<WorkerIdentity> {
+        let is_free = |who: &WorkerIdentity| self.workers.values().all(|w| *w.identity != *who);
+        let WorkerIdentity { host, name } = &wanted;
+        let namesakes =
+            (2u32..).map(|n| WorkerIdentity { host: host.clone(), name: format!("{name}#{n}") });
+        let found = std::iter::once(wanted.clone()).chain(namesakes).find(is_free);
+        Arc::new(found.unwrap_or(wanted))
+    }
+
+    pub(crate) fn join(&mut self, id: WorkerId, newcomer: Newcomer, now: Micros) {
+        let Newcomer { name, identity, reputation, threads, is_local } = newcomer;
         let worker = Worker {
             name: name.into(),
+            identity,
+            reputation,
             threads: threads.clamp(1, MAX_THREADS),
             is_local,
             since: now,
             leaving: false,
             is_spare: false,
+            paused_until: None,
             scenes: BTreeSet::new(),
             leases: 0,
             over: Vec::new(),
@@ -168,7 +194,6 @@ impl Roster {
             pings: VecDeque::new(),
             offset: None,
         };
-        self.threads += u64::from(worker.threads);
         self.workers.insert(id, worker);
         self.idle += 1;
         self.changes += 1;
@@ -180,7 +205,6 @@ impl Roster {
     pub(crate) fn remove(&mut self, id: WorkerId) -> Option<Worker> {
         let worker = self.workers.remove(id)?;
         self.idle -= usize::from(worker.has_idle_thread());
-        self.threads -= if worker.is_active() { u64::from(worker.threads) } else { 0 };
         self.changes += 1;
         self.choose();
         self.survey();
@@ -224,15 +248,10 @@ impl Roster {
         let staying = self.workers.iter().filter(|(_, w)| !w.leaving);
         let mut order: Vec<_> = staying.map(|(id, w)| key(id, w)).collect();
         order.sort_unstable();
-        for (i, (Reverse(threads), _, id)) in order.into_iter().enumerate() {
+        for (i, (_, _, id)) in order.into_iter().enumerate() {
             let w = self.workers.get_mut(id).expect("just listed");
             let is_spare = i >= self.limit;
-            if std::mem::replace(&mut w.is_spare, is_spare) != is_spare {
-                let threads = u64::from(threads);
-                self.threads =
-                    if is_spare { self.threads - threads } else { self.threads + threads };
-                self.changes += 1;
-            }
+            self.changes += u64::from(std::mem::replace(&mut w.is_spare, is_spare) != is_spare);
         }
     }
 
@@ -241,12 +260,35 @@ impl Roster {
         let Some(w) = self.workers.get_mut(id) else { return false };
         let news = !std::mem::replace(&mut w.leaving, true);
         if news {
-            self.threads -= if w.is_spare { 0 } else { u64::from(w.threads) };
             self.changes += 1;
             self.choose();
             self.survey();
         }
         news
+    }
+
+    /// Lends a worker nothing until a time.
+    pub(crate) fn pause(&mut self, id: WorkerId, until: Micros) {
+        let Some(w) = self.workers.get_mut(id) else { return };
+        w.paused_until = Some(until);
+        self.quiet_until = self.quiet_until.min(until);
+        self.changes += 1;
+        self.survey();
+    }
+
+    /// Lets workers whose pause is over take leases again. Returns whether there are any.
+    pub(crate) fn end_pauses(&mut self, now: Micros) -> bool {
+        let is_over = |w: &&mut Worker| w.paused_until.is_some_and(|until| until <= now);
+        let mut over = 0;
+        for worker in self.workers.values_mut().filter(is_over) {
+            worker.paused_until = None;
+            over += 1;
+        }
+        if over > 0 {
+            self.changes += over;
+            self.survey();
+        }
+        over > 0
     }
 
     /// Counts a lease.
@@ -300,8 +342,9 @@ impl Roster {
         })
     }
 
-    /// Looks at all active workers: how far away they are.
+    /// Looks at all active workers: their threads, and how far away they are.
     fn survey(&mut self) {
+        self.threads = self.active().map(|(_, w)| u64::from(w.threads)).sum();
         let half = self.active().filter_map(|(_, w)| Some(w.offset?.half_rtt)).max();
         let local = self.active().filter(|(_, w)| w.is_local).map(|(_, w)| u64::from(w.threads));
         self.is_mostly_local = 2 * local.sum::<u64>() > self.threads;
@@ -383,7 +426,10 @@ impl Roster {
                 (id, self.ping(id, now))
             })
             .collect();
-        let due = |w: &Worker| w.next_ping.min(w.heard.saturating_add(config.silence));
+        let due = |w: &Worker| {
+            let due = w.next_ping.min(w.heard.saturating_add(config.silence));
+            due.min(w.paused_until.unwrap_or(Micros::MAX))
+        };
         self.quiet_until = self.workers.values().map(due).min().unwrap_or(0);
         beaten
     }
@@ -421,11 +467,15 @@ mod tests {
         Config::default()
     }
 
+    fn newcomer(name: &str, threads: u32) -> Newcomer {
+        Newcomer { name: name.into(), threads, ..Newcomer::default() }
+    }
+
     #[test]
     fn clock_offset_comes_from_the_shortest_round_trip() {
         let mut r = Roster::default();
         let w = WorkerId(1);
-        r.join(w, "a".into(), 1, false, 0);
+        r.join(w, newcomer("a", 1), 0);
         assert_eq!(r.get(w).unwrap().to_master(5), None);
         // The worker's clock is 1,000,000 ahead. A slow, lopsided pong first.
         let n = r.ping(w, 100);
@@ -445,7 +495,7 @@ mod tests {
         let mut r = Roster::default();
         let counted = |r: &Roster| r.active().map(|(_, w)| u64::from(w.threads)).sum::<u64>();
         for (id, threads) in [(1, 3), (2, 0), (3, u32::MAX)] {
-            r.join(WorkerId(id), "a".into(), threads, false, 0);
+            r.join(WorkerId(id), newcomer("a", threads), 0);
         }
         assert_eq!((r.threads(), counted(&r)), (4 + u64::from(MAX_THREADS), r.threads()));
         assert!(r.leaves(WorkerId(3)) && !r.leaves(WorkerId(3)) && !r.leaves(WorkerId(9)));
@@ -460,7 +510,7 @@ mod tests {
     fn active_set_prefers_large_workers_then_every_second_pair() {
         let mut r = Roster::default();
         for id in 0..16 {
-            r.join(WorkerId(id), "a".into(), 1, false, 0);
+            r.join(WorkerId(id), newcomer("a", 1), 0);
         }
         let drawing = |r: &Roster| r.active().map(|(id, _)| id.0).collect::<Vec<_>>();
         let before = r.changes();
@@ -474,7 +524,7 @@ mod tests {
         r.leaves(WorkerId(4));
         assert_eq!(drawing(&r).len(), 8);
         assert!(!r.has_in_reserve(WorkerId(4)), "who leaves is nobody's reserve");
-        r.join(WorkerId(20), "large".into(), 8, false, 0);
+        r.join(WorkerId(20), newcomer("large", 8), 0);
         assert!(drawing(&r).contains(&20), "it has the most threads: {:?}", drawing(&r));
         let counted = r.active().map(|(_, w)| u64::from(w.threads)).sum::<u64>();
         assert_eq!(r.threads(), counted);
@@ -488,7 +538,7 @@ mod tests {
         let mut r = Roster::default();
         let w = WorkerId(1);
         r.watch(0, &config());
-        r.join(w, "a".into(), 1, false, 0);
+        r.join(w, newcomer("a", 1), 0);
         r.watch(900_000, &config());
         r.watch(60_000_000, &config());
         assert!(r.silent(60_000_000, &config()).is_empty());

@@ -265,7 +265,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
                 self.observer.frame_done(frame, state, *stats, spans);
                 self.do_some(when, Chore::Finish(frame), pixel_ns * pixels, wake_ns);
             }
-            Action::FrameFailed { frame, reason } => {
+            Action::FrameFailed { frame, reason, .. } => {
                 let number = self.frames[&frame].job.number as usize;
                 self.failed.get_or_insert(Unpredictable::Failed { frame: number, reason });
                 self.frames_in_hand = self.frames_in_hand.saturating_sub(1);
@@ -273,7 +273,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             Action::Drop { worker, .. } => {
                 self.dropped.insert(worker);
             }
-            Action::Progress { .. } => {}
+            Action::Progress { .. } | Action::Paused { .. } => {}
         }
     }
 

@@ -6,6 +6,7 @@
 mod pattern;
 mod statistics;
 mod stories;
+mod unfinished;
 mod world;
 
 use slabcast_common::ids::{FrameId, SceneId, WorkerId};

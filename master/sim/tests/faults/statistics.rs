@@ -4,7 +4,7 @@ use crate::pattern;
 use crate::stories::{job_with, slab};
 use slabcast_common::ids::{FrameId, WorkerId};
 use slabcast_common::quality::{Quality, Work};
-use slabcast_schedule::{Action, Clock, Config, Event, Micros, Scheduler};
+use slabcast_schedule::{Action, Clock, Config, Event, Micros, Scheduler, WorkerIdentity};
 use std::cell::Cell;
 
 /// A clock on which each look costs a millisecond.
@@ -27,6 +27,7 @@ fn statistics_of_a_frame_worked_out_by_hand() {
     let joined = Event::WorkerJoined {
         worker,
         name,
+        identity: WorkerIdentity::default(),
         threads: 1,
         is_local: false,
         memory_budget_bytes: u64::MAX,

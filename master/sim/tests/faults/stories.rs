@@ -12,15 +12,15 @@ use slabcast_sim::{Faults, Incident, Rng, WorkerProfile};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-const DIMS: [u32; 3] = [48, 48, 48];
-const BOTH: [Schedule; 2] = [Schedule::Slab, Schedule::Region];
+pub(crate) const DIMS: [u32; 3] = [48, 48, 48];
+pub(crate) const BOTH: [Schedule; 2] = [Schedule::Slab, Schedule::Region];
 
 /// Work under the paper's schedule.
 pub(crate) fn slab() -> Work {
     Work { schedule: Schedule::Slab, ..Work::default() }
 }
 
-fn bricks() -> Arc<[BrickInfo]> {
+pub(crate) fn bricks() -> Arc<[BrickInfo]> {
     pattern::bricks(&mut Rng::new(1), DIMS, 6)
 }
 
@@ -33,12 +33,12 @@ fn job(frame: u64) -> Box<FrameJob> {
     job_by(frame, Schedule::Slab)
 }
 
-fn job_by(frame: u64, schedule: Schedule) -> Box<FrameJob> {
+pub(crate) fn job_by(frame: u64, schedule: Schedule) -> Box<FrameJob> {
     let work = Work { tile: Some(32), schedule, ..slab() };
     job_with(frame, work, Quality { thickness: 2.0, ..Quality::before() })
 }
 
-fn world() -> World {
+pub(crate) fn world() -> World {
     new_world(0, Config::default())
 }
 
@@ -173,42 +173,7 @@ fn heartbeat_keeps_a_worker_that_is_busy_for_minutes() {
 }
 
 #[test]
-fn poisoned_tile_is_given_up_after_three_workers_and_the_rest_is_delivered() {
-    BOTH.into_iter().for_each(a_deadly_tile);
-}
-
-fn a_deadly_tile(schedule: Schedule) {
-    let mut w = world();
-    let deadly = WorkerProfile {
-        threads: 2,
-        faults: Faults { deadly_tile: Some([32, 32]), ..Faults::default() },
-        ..typical()
-    };
-    for _ in 0..6 {
-        w.add_worker(deadly.clone());
-    }
-    let work = Work { tile: Some(32), slabs: 1, schedule, ..slab() };
-    w.add_frame(job_with(0, work, Quality { thickness: 2.0, ..Quality::before() }));
-    w.until(|w| w.scheduler().is_idle());
-    let done = &w.observer.done[&FrameId(0)];
-    let poisoned = &done.stats.poisoned;
-    assert_eq!(poisoned.len(), 1, "{poisoned:?}");
-    assert_eq!((poisoned[0].x, poisoned[0].y, poisoned[0].size), (32, 32, 32));
-    assert_eq!(poisoned[0].workers.len(), 3);
-    assert_eq!(w.scheduler().totals().lost_workers, 3);
-    let reason = done.spans.iter().flat_map(|s| &s.args).find(|a| a.0 == "reason");
-    assert_eq!(reason.expect("a reason").1, "3 workers were lost with it");
-    let want = pattern::serial(&job_with(0, work, Quality { thickness: 2.0, ..Quality::before() }));
-    for (i, (got, want)) in
-        done.picture.as_ref().expect("sums").pixels.iter().zip(&want.pixels).enumerate()
-    {
-        let inside = (32..64).contains(&(i % 128)) && (32..64).contains(&(i / 128));
-        assert_eq!(*got, if inside { [0.0; 4] } else { *want }, "pixel {i}");
-    }
-}
-
-#[test]
-fn killed_workers_leave_the_same_bytes_and_no_poisoned_tile() {
+fn killed_workers_leave_the_same_bytes_and_no_failed_frame() {
     // Promise R1, in virtual time, with the default poison rule.
     for seed in 0..200 {
         let mut rng = Rng::new(seed);
@@ -223,28 +188,8 @@ fn killed_workers_leave_the_same_bytes_and_no_poisoned_tile() {
             w.schedule(when, Incident::Kill(WorkerId(id)));
         }
         w.finish();
-        let stats = &w.observer.done[&FrameId(0)].stats;
-        assert!(stats.poisoned.is_empty(), "seed {seed}: {:?}", stats.poisoned);
+        assert!(w.observer.done.contains_key(&FrameId(0)), "seed {seed}: no frame");
     }
-}
-
-#[test]
-fn frame_whose_tiles_all_fail_fails_with_the_reason() {
-    let mut w = world();
-    w.add_worker(WorkerProfile {
-        faults: Faults { fail_one_in: 1, ..Faults::default() },
-        ..typical()
-    });
-    w.add_frame(job(0));
-    w.add_frame(job(1));
-    w.until(|w| w.scheduler().is_idle());
-    assert_eq!(w.observer.audit.failed.len(), 2);
-    assert!(
-        w.observer.audit.failed[&FrameId(0)].contains("no reason"),
-        "{:?}",
-        w.observer.audit.failed
-    );
-    assert!(w.observer.done.is_empty());
 }
 
 #[test]
@@ -745,10 +690,7 @@ fn malformed_results_drop_their_worker_and_others_draw_its_tiles() {
         w.finish();
         assert_eq!(w.observer.audit.drops.len(), 1);
         assert!(w.observer.audit.drops[0].1.contains("plane"), "{}", w.observer.audit.drops[0].1);
-        assert!(
-            w.observer.done[&FrameId(0)].stats.poisoned.is_empty(),
-            "a malformed result does not poison its tile"
-        );
+        assert!(w.observer.done.contains_key(&FrameId(0)), "the other worker drew its tile");
     }
 }
 

@@ -17,7 +17,8 @@ pub use statistics::{StatisticsPart, StatisticsParts};
 pub use submit::{submit_from_wire, submit_to_wire};
 pub use volume::{volume_from_wire, volume_to_wire};
 pub use watch::{
-    frame_to_wire, notice_to_wire, watch_checked, watch_from_wire, watch_with_checksum,
+    frame_failed_to_wire, frame_to_wire, notice_to_wire, watch_checked, watch_from_wire,
+    watch_with_checksum,
 };
 
 use super::{WireError, enum_conversions};

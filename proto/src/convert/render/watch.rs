@@ -1,4 +1,4 @@
-//! Messages of WatchFrames: chunks of frames, and notices.
+//! Messages of WatchFrames: chunks of frames, failures of frames, and notices.
 
 use super::shared::{format_from_wire, format_to_wire};
 use super::statistics::{StatisticsPart, statistics_to_wire};
@@ -6,7 +6,7 @@ use super::{enum_conversions, wire};
 use crate::MAX_FRAME_CHUNK;
 use crate::convert::numbers::size_from_wire;
 use crate::convert::{WireError, cut, reason_from_wire, reason_to_wire, required};
-use crate::model::{FrameChunk, JobNotice, JobState, WatchMessage};
+use crate::model::{FrameChunk, FrameFailure, JobNotice, JobState, WatchMessage};
 use bytes::Bytes;
 use prost::Message as _;
 use slabcast_common::image::PixelFormat;
@@ -84,10 +84,17 @@ pub fn notice_to_wire(notice: &JobNotice) -> wire::WatchFramesResponse {
     message(wire::watch_frames_response::Message::Notice(wire::JobNotice {
         state: state_to_wire(notice.state),
         frames_done: notice.frames_done,
+        frames_failed: notice.frames_failed,
         frames_total: notice.frames_total,
         render_threads: notice.render_threads,
         message: reason_to_wire(&notice.message),
     }))
+}
+
+/// Writes the failure of a frame as a message of a watch, in place of its chunks.
+pub fn frame_failed_to_wire(frame: u64, reason: &str) -> wire::WatchFramesResponse {
+    let reason = reason_to_wire(reason);
+    message(wire::watch_frames_response::Message::Failed(wire::FrameFailed { frame, reason }))
 }
 
 fn message(message: wire::watch_frames_response::Message) -> wire::WatchFramesResponse {
@@ -118,7 +125,7 @@ pub fn watch_checked(message: wire::WatchFramesResponse) -> Option<wire::WatchFr
     }
 }
 
-/// Converts one message of `WatchFrames`: a piece of a frame, or a notice.
+/// Converts one message of `WatchFrames`: a piece of a frame, its failure, or a notice.
 ///
 /// # Errors
 /// [`WireError`] names the field that is wrong.
@@ -134,6 +141,10 @@ pub fn watch_from_wire(response: wire::WatchFramesResponse) -> Result<WatchMessa
         Message::Checked(_) => {
             Err(WireError::value("checked", "was not asked for, or is within another"))
         }
+        Message::Failed(wire::FrameFailed { frame, reason }) => {
+            let reason = reason_from_wire("reason", reason).map_err(|e| e.within("failed"))?;
+            Ok(WatchMessage::Failed(FrameFailure { frame, reason }))
+        }
     }
 }
 
@@ -141,6 +152,7 @@ fn notice_from_wire(notice: wire::JobNotice) -> Result<JobNotice, WireError> {
     Ok(JobNotice {
         state: state_from_wire("state", notice.state)?,
         frames_done: notice.frames_done,
+        frames_failed: notice.frames_failed,
         frames_total: notice.frames_total,
         render_threads: notice.render_threads,
         message: reason_from_wire("message", notice.message)?,

@@ -339,6 +339,59 @@ fn full_disk_pauses_the_job_until_there_is_room() {
     assert_eq!(names(room), ["turn.apng"]);
 }
 
+/// Starts a run of 40 frames into `out/` and takes that folder away, to `to`, after the first.
+fn run_whose_folder_goes(
+    folder: &Path,
+    to: &str,
+) -> (std::process::Child, Vec<String>, std::sync::mpsc::Receiver<String>) {
+    let args = ["render", "formula:spheres:32", "--size", "120x90", "--frames", "40", "-o", "out/"];
+    let mut child =
+        slabcast(folder, &args).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
+    let lines = listen(&mut child);
+    let patience = Duration::from_secs(60);
+    let since = Instant::now();
+    while !folder.join("out/frame_0000.png").exists() {
+        assert!(since.elapsed() < patience, "no frame comes");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    std::fs::rename(folder.join("out"), folder.join(to)).unwrap();
+    let mut said = Vec::new();
+    while !said.iter().any(|l: &String| l.contains("paused")) {
+        said.push(lines.recv_timeout(patience).unwrap_or_else(|_| panic!("{said:?}")));
+    }
+    let paused = said.last().unwrap();
+    assert!(paused.starts_with("warning: paused: the folder is gone to write "), "{paused}");
+    assert!(paused.contains("when the folder is back"), "{paused}");
+    assert!(child.try_wait().unwrap().is_none(), "it waits");
+    (child, said, lines)
+}
+
+#[test]
+fn folder_that_is_gone_pauses_the_job_until_it_is_back() {
+    let dir = tempfile::tempdir().unwrap();
+    let (mut child, mut said, lines) = run_whose_folder_goes(dir.path(), "away");
+    std::fs::rename(dir.path().join("away"), dir.path().join("out")).unwrap();
+    assert_eq!(end(&mut child, Duration::from_secs(60)), 0, "{said:?}");
+    said.extend(lines.iter());
+    assert!(said.iter().any(|l| l.contains("the folder is back: going on")), "{said:?}");
+    let frames = names(&dir.path().join("out"));
+    assert_eq!(frames.iter().filter(|n| n.starts_with("frame_")).count(), 40, "{frames:?}");
+}
+
+#[test]
+fn frames_that_went_with_their_folder_are_not_said_to_be_kept() {
+    let dir = tempfile::tempdir().unwrap();
+    let (mut child, mut said, lines) = run_whose_folder_goes(dir.path(), "away");
+    std::fs::create_dir(dir.path().join("out")).unwrap();
+    assert_eq!(end(&mut child, Duration::from_secs(60)), 1, "{said:?}");
+    said.extend(lines.iter());
+    let there = names(&dir.path().join("out")).len();
+    assert!(there < 40, "{there}");
+    let gone = format!("out/: {} of 40 frames were taken away after they were written", 40 - there);
+    assert!(said.iter().any(|l| l.contains(&gone)), "want {gone:?} in {said:?}");
+    assert!(said.iter().any(|l| l.contains(&format!("kept {there} of 40 frames"))), "{said:?}");
+}
+
 #[cfg(target_os = "linux")]
 #[test]
 fn ctrl_c_ends_a_paused_job_and_keeps_whole_files() {

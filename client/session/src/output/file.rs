@@ -1,8 +1,10 @@
-//! Files that are whole or not there, and patience with a disk that is full.
+//! Files that are whole or not there, and patience with a disk that is full or away.
 //!
 //! A file is filled under a hidden name in its folder, synced, and renamed; so its own name always
 //! holds all of it, whatever happens (full disk, Ctrl-C, power). A full disk is weather, not an
-//! end: hours of rendering wait at the master for somebody to make room ([`DiskWait`]).
+//! end: hours of rendering wait at the master for somebody to make room ([`DiskWait`]). So is a
+//! folder that was moved away, unmounted or made read-only: files could be made in it when the run
+//! began.
 
 use crate::fail::Fail;
 use crate::progress;
@@ -68,11 +70,12 @@ pub fn write_atomic(
     whole(path, fill).map_err(|e| Fail::io(path, "writing", &e))
 }
 
-/// Time between two attempts on a full disk. A person who deletes something looks at the progress
+/// Time between two attempts on a disk that takes nothing. A person who deletes something looks at the progress
 /// within a second or two; at a tenth of this, nothing is gained and logs of the file system fill.
 const TRY_AGAIN: Duration = Duration::from_secs(1);
 
-/// Waits for room on a full disk: warns once and tries again.
+/// Waits for a disk that takes nothing: full, or its folder gone or read-only. Warns once and tries
+/// again.
 #[derive(Debug, Default)]
 pub struct DiskWait {
     given_up: AtomicBool,
@@ -80,33 +83,39 @@ pub struct DiskWait {
 }
 
 impl DiskWait {
-    /// Ends all waiting: writes to a full disk fail from now on.
+    /// Ends all waiting: what can't be written fails from now on.
     pub fn give_up(&self) {
         self.given_up.store(true, Ordering::SeqCst);
     }
 
-    /// `write`, again and again while there is no room.
-    fn until_room(&self, path: &Path, mut write: impl FnMut() -> Result<()>) -> Result<()> {
+    /// Makes an attempt to write, again and again while the disk takes nothing.
+    pub(super) fn until_taken<T>(
+        &self,
+        path: &Path,
+        mut write: impl FnMut() -> Result<T>,
+    ) -> Result<T> {
+        let mut over = "there is room again";
         loop {
-            match write() {
-                Err(e) if no_room(&e) && !self.given_up.load(Ordering::SeqCst) => {
-                    if !self.waiting.swap(true, Ordering::SeqCst) {
-                        progress::warn(&one_line(&format!(
-                            "paused: no room to write {} ({}); it goes on by itself when there is \
-                             room, Ctrl-C ends it and keeps what is done",
-                            path.display(),
-                            crate::fail::reason(&e)
-                        )));
-                    }
-                    self.wait();
-                }
+            let e = match write() {
+                Err(e) if !self.given_up.load(Ordering::SeqCst) => e,
                 other => {
                     if other.is_ok() && self.waiting.swap(false, Ordering::SeqCst) {
-                        progress::note("there is room again: going on");
+                        progress::note(&format!("{over}: going on"));
                     }
                     return other;
                 }
+            };
+            let Some([what, until, again]) = weather(&e) else { return Err(e) };
+            over = again;
+            if !self.waiting.swap(true, Ordering::SeqCst) {
+                progress::warn(&one_line(&format!(
+                    "paused: {what} to write {} ({}); it goes on by itself when {until}, Ctrl-C \
+                     ends it and keeps what is done",
+                    path.display(),
+                    crate::fail::reason(&e)
+                )));
             }
+            self.wait();
         }
     }
 
@@ -120,7 +129,8 @@ impl DiskWait {
         }
     }
 
-    /// Writes a whole file or none, and waits while the disk is full.
+    /// Writes a whole file or none, and waits while the disk is full, or its folder gone or
+    /// read-only.
     ///
     /// # Errors
     /// The file can't be written.
@@ -129,13 +139,26 @@ impl DiskWait {
         path: &Path,
         fill: impl Fn(&mut BufWriter<&File>) -> Result<()>,
     ) -> std::result::Result<(), Fail> {
-        self.until_room(path, || whole(path, &fill)).map_err(|e| Fail::io(path, "writing", &e))
+        self.until_taken(path, || whole(path, &fill)).map_err(|e| Fail::io(path, "writing", &e))
     }
 }
 
-/// Whether it is the disk, or the user's share of it, that is full.
-fn no_room(e: &Error) -> bool {
-    matches!(e.kind(), ErrorKind::StorageFull | ErrorKind::QuotaExceeded)
+/// Returns what is wrong with a disk where a file could be made before, what will end it, and what
+/// to say then; `None` for other errors.
+fn weather(e: &Error) -> Option<[&'static str; 3]> {
+    Some(match e.kind() {
+        // The disk, or the user's share of it.
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
+            ["no room", "there is room", "there is room again"]
+        }
+        ErrorKind::NotFound | ErrorKind::NotADirectory | ErrorKind::StaleNetworkFileHandle => {
+            ["the folder is gone", "the folder is back", "the folder is back"]
+        }
+        ErrorKind::ReadOnlyFilesystem | ErrorKind::PermissionDenied => {
+            ["not allowed", "it is allowed", "it is allowed again"]
+        }
+        _ => return None,
+    })
 }
 
 /// A file that grows piece by piece and gets its name at the end. A piece is there as a whole or
@@ -155,7 +178,7 @@ impl GrowingFile {
     /// Adds a piece; waits where there is no room for it.
     pub(crate) fn add(&mut self, piece: &[u8], patience: &DiskWait) -> Result<()> {
         let GrowingFile { path, file, long } = self;
-        patience.until_room(path, || {
+        patience.until_taken(path, || {
             // Removes what a failed attempt left.
             file.as_file().set_len(*long)?;
             file.seek(SeekFrom::Start(*long))?;
@@ -177,9 +200,27 @@ impl GrowingFile {
         &self.path
     }
 
-    /// Gives the file its name.
-    pub(crate) fn settle(self) -> Result<()> {
-        settle(self.file, &self.path)
+    /// Gives the file its name. Waits while its folder is gone or read-only. Where the hidden file
+    /// went with the folder, it is written once more, from what is still open.
+    pub(crate) fn settle(self, patience: &DiskWait) -> Result<()> {
+        let GrowingFile { path, file, .. } = self;
+        file.as_file().sync_all()?;
+        let mut unnamed = Some(file);
+        patience.until_taken(&path, || {
+            let file = unnamed.take().expect("put back after each failure");
+            let failed = match file.persist(&path) {
+                Ok(_) => return Ok(()),
+                Err(failed) => failed,
+            };
+            let open = unnamed.insert(failed.file);
+            if open.path().exists() {
+                return Err(failed.error);
+            }
+            let mut copy = beside(&path)?;
+            open.as_file_mut().seek(SeekFrom::Start(0))?;
+            std::io::copy(open.as_file_mut(), copy.as_file_mut())?;
+            settle(copy, &path)
+        })
     }
 }
 
@@ -219,6 +260,62 @@ mod tests {
     }
 
     #[test]
+    fn a_folder_that_is_gone_is_waited_for() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("out");
+        let path = folder.join("f");
+        let tries = std::cell::Cell::new(0);
+        let back_at_the_second = || {
+            tries.set(tries.get() + 1);
+            if tries.get() == 2 {
+                std::fs::create_dir(&folder).unwrap();
+            }
+            whole(&path, |out| out.write_all(b"whole"))
+        };
+        DiskWait::default().until_taken(&path, back_at_the_second).unwrap();
+        assert_eq!((tries.get(), std::fs::read(&path).unwrap()), (2, b"whole".to_vec()));
+        let patience = DiskWait::default();
+        patience.give_up();
+        std::fs::remove_dir_all(&folder).unwrap();
+        assert!(patience.write_atomic(&path, |out| out.write_all(b"whole")).is_err());
+    }
+
+    #[test]
+    fn only_a_disk_that_takes_nothing_is_waited_for() {
+        for kind in [
+            ErrorKind::StorageFull,
+            ErrorKind::QuotaExceeded,
+            ErrorKind::NotFound,
+            ErrorKind::ReadOnlyFilesystem,
+            ErrorKind::PermissionDenied,
+        ] {
+            assert!(weather(&kind.into()).is_some(), "{kind}");
+        }
+        for kind in [ErrorKind::BrokenPipe, ErrorKind::InvalidInput, ErrorKind::Other] {
+            assert!(weather(&kind.into()).is_none(), "{kind}");
+            let failed =
+                DiskWait::default().until_taken(Path::new("f"), || Err::<(), _>(kind.into()));
+            assert_eq!(failed.unwrap_err().kind(), kind);
+        }
+    }
+
+    #[test]
+    fn a_growing_file_whose_folder_went_is_whole_when_the_folder_is_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("out");
+        std::fs::create_dir(&folder).unwrap();
+        let path = folder.join("g");
+        let mut g = GrowingFile::new(&path).unwrap();
+        g.add(b"0123", &DiskWait::default()).unwrap();
+        std::fs::remove_dir_all(&folder).unwrap();
+        g.add(b"45", &DiskWait::default()).unwrap();
+        std::fs::create_dir(&folder).unwrap();
+        g.settle(&DiskWait::default()).unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), b"012345");
+        assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1);
+    }
+
+    #[test]
     fn a_growing_file_has_its_name_at_the_end() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("g");
@@ -227,7 +324,7 @@ mod tests {
         g.add(b"45", &DiskWait::default()).unwrap();
         g.patch(1, b"ab").unwrap();
         assert!(!path.exists());
-        g.settle().unwrap();
+        g.settle(&DiskWait::default()).unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), b"0ab345");
     }
 }

@@ -131,8 +131,8 @@ impl Lines {
         match self {
             Lines::Kept(mut kept) => {
                 kept.write()?;
-                let Kept { path, file: Some(file), .. } = kept else { return Ok(()) };
-                file.settle().map_err(|e| Fail::io(&path, "writing", &e))
+                let Kept { path, file: Some(file), patience, .. } = kept else { return Ok(()) };
+                file.settle(&patience).map_err(|e| Fail::io(&path, "writing", &e))
             }
             _ => Ok(()),
         }

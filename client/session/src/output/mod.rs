@@ -377,6 +377,14 @@ impl Output {
         matches!(self.target, Target::Pipe(None))
     }
 
+    /// Returns the place of the frames for people.
+    fn place(&self) -> String {
+        match &self.target {
+            Target::Folder(folder) => folder.shown(),
+            _ => self.shown(&[]),
+        }
+    }
+
     /// Returns the target for people: `slabcast-out/ (frame_0000.png ... frame_0017.png)`,
     /// `turn.y4m`, `stdout`.
     pub fn shown(&self, written: &[u64]) -> String {
@@ -424,7 +432,7 @@ impl Movie {
             }
         };
         if let Sink::New(path) = &self.sink {
-            self.sink = Sink::File(GrowingFile::new(path)?);
+            self.sink = Sink::File(patience.until_taken(path, || GrowingFile::new(path))?);
         }
         match &mut self.sink {
             Sink::New(_) => unreachable!("begun above"),
@@ -446,7 +454,7 @@ impl Movie {
             file.add(&tail, patience)?;
             file.patch(at, &patch)?;
         }
-        file.settle()
+        file.settle(patience)
     }
 
     fn path(&self) -> String {
@@ -578,6 +586,16 @@ impl Writer {
                 first = Err(e);
             }
         }
+        let before = self.written.len();
+        let there = self.written().len();
+        if first.is_ok() && there < before {
+            first = Err(Fail::failed(format!(
+                "{}: {} of {before} frames were taken away after they were written; render them \
+                 again",
+                self.output.place(),
+                before - there
+            )));
+        }
         if self.written.is_empty() {
             return first;
         }
@@ -599,8 +617,12 @@ impl Writer {
         first.and(ended.unwrap_or_else(|e| Err(Fail::failed(format!("writing failed: {e}")))))
     }
 
-    /// Returns the numbers of the frames on disk, ascending.
+    /// Returns the numbers of the frames on disk, ascending. Files that somebody took away after
+    /// they were written are none of them.
     pub fn written(&mut self) -> &[u64] {
+        if let Target::Folder(folder) = &self.output.target {
+            self.written.retain(|&number| folder.file(number).exists());
+        }
         self.written.sort_unstable();
         &self.written
     }

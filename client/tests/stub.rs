@@ -264,7 +264,7 @@ async fn frame_in_many_chunks_is_assembled_with_its_statistics() {
     let size = [1000, 900];
     let mut all = vec![notice(JobState::Running, 2, "")];
     all.extend(chunks(0, size, "[{\"name\":\"render\"}]"));
-    assert_eq!(all.len(), 1 + 4, "3.6 MB take four messages of 1 MiB");
+    assert_eq!(all.len(), 1 + 14, "3.6 MB take 14 messages of 256 KiB");
     all.insert(3, notice(JobState::WaitingForWorkers, 2, "waiting for workers"));
     all.extend(chunks(1, [3, 1], ""));
     all.push(notice(JobState::Done, 2, ""));

@@ -8,6 +8,7 @@
 //! thread) for its queue and its timer alone, so that culling a large volume delays no stream.
 
 mod actions;
+mod feed;
 mod jobs;
 
 use crate::admission::{AttachError, WorkerTable};
@@ -20,10 +21,13 @@ use crate::jobs::active::ActiveJobs;
 use crate::jobs::submit::{Plan, SubmitError};
 use crate::jobs::{FinishedFrame, JobState, Jobs};
 use crate::link::{Caller, WorkerLink};
+use crate::memory::Shares;
 use crate::panics::Panicked;
 use crate::record::RecordedScheduler;
+use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, JobId, WorkerId};
 use slabcast_common::message::{Hello, SceneSpec, TOLD_TO_STOP, ToMaster, ToWorker};
+use slabcast_common::view::View;
 use slabcast_common::volume::Volume;
 use slabcast_proto::model::Worker;
 use slabcast_schedule::{Clock, Event as Happened, Micros};
@@ -50,9 +54,9 @@ pub(crate) enum Event {
     Detached { worker: WorkerId, reason: String, is_damage: bool },
     /// A client's request was checked.
     Submit { plan: Box<Plan>, reply: oneshot::Sender<Result<JobId, SubmitError>> },
-    /// A job's bricks were cut.
-    BricksCut { job: JobId, store: Result<Arc<BrickStore>, Panicked> },
-    /// A watcher took a frame, so that there may be room for another.
+    /// A brick set was cut.
+    BricksCut { set: BrickSetKey, store: Result<Arc<BrickStore>, Panicked> },
+    /// A watcher took a frame, so that there may be room for another, or waits for one.
     FrameTaken,
     /// A frame was finished.
     Finished { job: JobId, flight: FrameId, frame: FinishedFrame },
@@ -79,6 +83,14 @@ struct Flight {
     job: JobId,
     number: u64,
     scene: Arc<SceneSpec>,
+    view: View,
+    /// The brick set that it is drawn from.
+    store: Arc<BrickStore>,
+    /// Whether a watcher waited for it when it began.
+    wanted: bool,
+    /// Bytes that it takes while it is made, and when it is finished.
+    making_bytes: u64,
+    finished_bytes: u64,
     /// Spans of the log that its lines belong to.
     frame_span: tracing::Span,
     slab_span: Option<(u32, tracing::Span)>,
@@ -90,9 +102,13 @@ struct Flight {
 pub(crate) struct Driver {
     volume: Arc<Volume>,
     served: Arc<ServedVolume>,
-    frame_budget_bytes: usize,
+    shares: Shares,
     clock: RealClock,
     rehearse: bool,
+    /// A frame that waits for memory.
+    blocked: Option<feed::Blocked>,
+    /// When to look for frames that may begin although nothing happens.
+    look_again_at: Option<Micros>,
     /// Workers in reserve when the log told of it last.
     logged_reserve: usize,
     scheduler: RecordedScheduler,
@@ -110,7 +126,7 @@ pub(crate) struct Driver {
 impl Driver {
     pub(crate) fn new(
         (volume, served): (Arc<Volume>, Arc<ServedVolume>),
-        frame_budget_bytes: usize,
+        shares: Shares,
         rehearse: bool,
         scheduler: RecordedScheduler,
         workers: WorkerTable,
@@ -121,16 +137,18 @@ impl Driver {
         Driver {
             volume,
             served,
-            frame_budget_bytes,
+            shares,
             clock: RealClock(Instant::now()),
             rehearse,
+            blocked: None,
+            look_again_at: None,
             logged_reserve: 0,
             scheduler,
             workers,
             last_frame_id: 0,
             jobs,
             active: ActiveJobs::default(),
-            brick_sets: BrickSets::default(),
+            brick_sets: BrickSets::new(shares.bricks),
             flights: BTreeMap::new(),
             inbox,
             finishers,
@@ -141,7 +159,8 @@ impl Driver {
     /// Handles events until the master is told to end.
     pub(crate) async fn run(mut self, mut events: mpsc::Receiver<Event>) {
         loop {
-            let deadline = self.scheduler.next_deadline();
+            let deadline =
+                self.scheduler.next_deadline().into_iter().chain(self.look_again_at).min();
             let until = deadline.map(|d| self.clock.0 + Duration::from_micros(d));
             let event = match until {
                 None => events.recv().await,
@@ -149,8 +168,15 @@ impl Driver {
                     biased;
                     event = events.recv() => event,
                     () = tokio::time::sleep_until(until.into()) => {
-                        self.scheduler.handle(&self.clock, Happened::Tick);
-                        self.act();
+                        let now = self.clock.now();
+                        if self.scheduler.next_deadline().is_some_and(|d| d <= now) {
+                            self.scheduler.handle(&self.clock, Happened::Tick);
+                            self.act();
+                        }
+                        if self.look_again_at.is_some_and(|at| at <= now) {
+                            self.feed();
+                            self.act();
+                        }
                         continue;
                     }
                 },
@@ -171,6 +197,8 @@ impl Driver {
                 }
                 self.handle(event);
             }
+            // Orders for bricks leave before a set may make place for another.
+            self.act();
             self.feed();
             self.act();
         }
@@ -213,7 +241,7 @@ impl Driver {
             Event::Submit { plan, reply } => {
                 let _ = reply.send(self.submit(*plan));
             }
-            Event::BricksCut { job, store } => self.bricks_cut(job, store),
+            Event::BricksCut { set, store } => self.bricks_cut(set, store),
             Event::FrameTaken => {}
             Event::Finished { job, flight, frame } => self.finished(job, flight, frame),
             Event::FinishFailed { frame, reason } => self.fail_frame(frame, &reason),

@@ -7,6 +7,7 @@ use crate::hooks::{Hooks, Stage};
 use crate::jobs::submit::{Plan, SubmitError, check_key};
 use crate::jobs::{JobView, Jobs, Watch};
 use crate::link::{Caller, WorkerLink};
+use crate::memory::Shares;
 use crate::panics::caught;
 use crate::record::{RecordedScheduler, Recorder};
 use slabcast_common::ids::{JobId, WorkerId};
@@ -19,8 +20,8 @@ use std::sync::Arc;
 use std::time::SystemTime;
 use tokio::sync::{Semaphore, mpsc, oneshot};
 
-/// Requests that are checked at a time: with two, a path of 100,000 views does not hold up a short
-/// one. Each may take 50 MB of views.
+/// Requests that are checked at a time: with two, one whose bricks are looked through for its
+/// framing does not hold up a short one.
 const PLANS_AT_ONCE: usize = 2;
 
 /// Events that wait for the driver before whoever sends one has to wait.
@@ -32,8 +33,8 @@ pub struct MasterConfig {
     pub volume: Arc<Volume>,
     /// Axes of the volume that are up and front.
     pub orientation: Orientation,
-    /// Bytes of finished frames that the master keeps.
-    pub frame_budget_bytes: usize,
+    /// Bytes that the master may hold, by what takes them.
+    pub shares: Shares,
     /// Settings of the scheduler that the master drives.
     pub schedule: slabcast_schedule::Config,
     /// Recorder of the scheduler's events and decisions ([`crate::record::start`]).
@@ -46,13 +47,13 @@ pub struct MasterConfig {
 }
 
 impl MasterConfig {
-    /// Returns the defaults for `volume`: 256 MiB of finished frames (64 frames of 1024x1024
-    /// RGBA8), no record, no rehearsal.
+    /// Returns the defaults for `volume`: the memory of a master that serves its own process, no
+    /// record, no rehearsal.
     pub fn new(volume: impl Into<Arc<Volume>>, orientation: Orientation) -> Self {
         MasterConfig {
             volume: volume.into(),
             orientation,
-            frame_budget_bytes: 256 << 20,
+            shares: Shares::default(),
             schedule: slabcast_schedule::Config::default(),
             record: None,
             rehearse: false,
@@ -101,7 +102,7 @@ impl Master {
         let (inbox, events) = mpsc::channel(INBOX);
         // Ids are never used again, not even by the next master at this address: a client that
         // takes up its watch must not see another's job.
-        let jobs = Arc::new(Jobs::starting_after(unix_ms() as u64));
+        let jobs = Arc::new(Jobs::new(unix_ms() as u64, config.shares.requests));
         let finishers = Finishers::start(&inbox, &config.hooks)?;
         let handle = Handle {
             inbox: inbox.clone(),
@@ -109,6 +110,7 @@ impl Master {
             served: served.clone(),
             volume: config.volume.clone(),
             planning: Arc::new(Semaphore::new(PLANS_AT_ONCE)),
+            shares: config.shares,
             hooks: config.hooks.clone(),
         };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build()?;
@@ -119,7 +121,7 @@ impl Master {
         let scheduler = RecordedScheduler::new(config.schedule, config.record);
         let driver = Driver::new(
             (config.volume, served),
-            config.frame_budget_bytes,
+            config.shares,
             config.rehearse,
             scheduler,
             workers,
@@ -155,6 +157,7 @@ pub struct Handle {
     served: Arc<ServedVolume>,
     volume: Arc<Volume>,
     planning: Arc<Semaphore>,
+    shares: Shares,
     hooks: Hooks,
 }
 
@@ -182,14 +185,16 @@ impl Handle {
                 return Ok(job.view.id);
             }
         }
+        // Whom the driver would turn away costs no check.
+        let _checking = self.jobs.reserve(request.held_bytes())?;
         let place = self.planning.clone().acquire_owned().await.map_err(|_| SubmitError::Gone)?;
         let (served, hooks) = (self.served.clone(), self.hooks.clone());
-        let volume = self.volume.clone();
+        let (volume, shares) = (self.volume.clone(), self.shares);
         let planned = tokio::task::spawn_blocking(move || {
             let _place = place;
             caught("checking the request", || {
                 hooks.reach(Stage::Plan);
-                Plan::new(request, &served, &volume)
+                Plan::new(request, &served, &volume, &shares)
             })
         });
         let plan = planned.await.map_err(|_| SubmitError::Gone)?;

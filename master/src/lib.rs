@@ -8,6 +8,7 @@
 //! - [`jobs`] is the table of view paths and their finished frames, shared with whoever waits for
 //!   them; [`jobs::submit`] checks requests.
 //! - [`finish`] turns finished sums into pictures, hashes and bytes, on threads beside the driver.
+//! - [`memory`] says what a master may hold.
 //! - [`link`] is the driver's end of a link to a worker, and the embedded link without a network.
 //! - [`record`] writes down what the scheduler is told and decides, and replays it.
 //! - [`serve`] is gRPC: the only part that knows TCP.
@@ -52,7 +53,7 @@ pub mod handle;
 mod hooks;
 pub mod jobs;
 pub mod link;
-mod memory;
+pub mod memory;
 mod panics;
 pub mod record;
 pub mod serve;

@@ -1,61 +1,179 @@
-//! Checks that pictures fit in memory before any memory is taken.
+//! Memory of a master: what it may hold, and what a picture takes.
+//!
+//! Three things take memory because somebody asks: the requests of open jobs, brick sets, and
+//! frames (in the making, and finished ones that wait to be taken). Each has a share, and what
+//! does not fit its share waits or is refused with both figures.
 //!
 //! A picture's sums and its finished pixels exist side by side while it is encoded. At 512x512 they
-//! take 18 MB, which matters to nobody; at 8192x8192 they take 4.5 GB, which may end the machine or
-//! every other job of this master.
+//! take 6 MB, which matters to nobody; at 8192x8192 they take up to 4.5 GB, which may end the
+//! machine or every other job of this master.
 
 use slabcast_common::image::{FrameState, PixelFormat};
-use slabcast_common::quality::InvalidField;
+use slabcast_common::quality::{InvalidField, Schedule};
+use slabcast_common::volume::Volume;
+use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::request::PathRequest;
 
-/// Frames of more bytes than this are rendered one at a time, not four: workers then idle between
-/// two frames while one is encoded, seconds of minutes. At half, pictures of 4096x4096 lose their
-/// overlap; four frames of just under this take 8.6 GB, and at twice this, twice as much.
-const ONE_AT_A_TIME_BYTES: u64 = 2 << 30;
+/// Bytes of finished frames and frames in the making: 64 frames of 1024x1024 RGBA8. At half, four
+/// frames of 2048x2048 are no longer drawn side by side; at twice this, strangers' frames that
+/// nobody takes fill half a gigabyte.
+const FRAMES: u64 = 256 << 20;
 
-/// Returns the bytes of a picture's sums and of its finished pixels.
-fn frame_bytes(size: [u32; 2], format: PixelFormat) -> u64 {
-    const FINISHED: u64 = 16;
-    let pixels = u64::from(size[0]) * u64::from(size[1]);
-    pixels * (FrameState::BYTES_A_PIXEL + FINISHED + format.bytes() as u64)
+/// Bytes of frames in the making of a master that has no limit: four of 2 GiB, as a picture of
+/// 4096x4096 takes under the `slab` schedule.
+const UNLIMITED_FLIGHTS: u64 = 8 << 30;
+
+/// Bytes of the requests of all open jobs, and of the jobs that are remembered. A turntable takes
+/// some 3 KiB, a path of 10,000 views 1.2 MiB.
+const REQUESTS: usize = 64 << 20;
+
+/// Bytes that a master may hold at most, by what takes them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Shares {
+    /// Finished frames, together with those in the making where it is limited.
+    pub frames: u64,
+    /// Frames in the making; one alone may take more.
+    pub flights: u64,
+    /// The largest frame that is taken; `None`: whatever this machine has free.
+    pub largest_frame: Option<u64>,
+    /// Brick sets; one alone may take more.
+    pub bricks: u64,
+    /// Requests of open jobs.
+    pub requests: usize,
 }
 
-/// Returns whether frames of this size may be in flight with others.
-pub(crate) fn beside_others(size: [u32; 2], format: PixelFormat) -> bool {
-    frame_bytes(size, format) <= ONE_AT_A_TIME_BYTES
+impl Default for Shares {
+    /// The shares of a master that serves its own process: what its machine has.
+    fn default() -> Self {
+        Shares {
+            frames: FRAMES,
+            flights: UNLIMITED_FLIGHTS,
+            largest_frame: None,
+            bricks: u64::MAX,
+            requests: REQUESTS,
+        }
+    }
 }
 
-/// Checks that this machine has memory for a picture now.
-pub(crate) fn check(size: [u32; 2], format: PixelFormat) -> Result<(), InvalidField> {
-    available().map_or(Ok(()), |free| fits(size, format, free))
+impl Shares {
+    /// Returns the shares of a master that may hold `bytes` beside its volume.
+    pub fn of(bytes: u64) -> Self {
+        let frames = (bytes / 4).min(FRAMES);
+        Shares {
+            frames,
+            flights: frames,
+            largest_frame: Some(bytes / 2),
+            bricks: bytes / 4,
+            requests: REQUESTS.min((bytes / 16) as usize),
+        }
+    }
+
+    /// Checks that the master has memory for the frames of a request.
+    ///
+    /// # Errors
+    /// Names `size`, with what a frame takes and what there is.
+    pub(crate) fn check(&self, request: &PathRequest) -> Result<(), InvalidField> {
+        let (need, size) = (making_bytes(request), request.path.size);
+        let free = available();
+        let most = [free, self.largest_frame].into_iter().flatten().min();
+        most.map_or(Ok(()), |most| fits(size, need, most))
+    }
 }
 
-fn fits(size: [u32; 2], format: PixelFormat, free: u64) -> Result<(), InvalidField> {
-    let need = frame_bytes(size, format);
-    if need <= free {
+/// Returns the bytes that a frame of this request takes at most while it is made: its sums, and its
+/// finished pixels.
+pub(crate) fn making_bytes(request: &PathRequest) -> u64 {
+    let [w, h] = request.path.size.map(u64::from);
+    w * h * (sums_bytes(request.work.schedule, request.want_hash) + finished_bytes(request.format))
+}
+
+fn finished_bytes(format: PixelFormat) -> u64 {
+    format.bytes() as u64
+}
+
+/// Bytes of a pixel before it is encoded. Under `region` each pixel comes once, as opacity and
+/// three colours, or finished.
+fn sums_bytes(schedule: Schedule, hashed: bool) -> u64 {
+    match (schedule, hashed) {
+        (Schedule::Slab, _) => FrameState::BYTES_A_PIXEL,
+        (_, true) => 16,
+        // Tiles that wait to be laid into the picture.
+        (_, false) => 4,
+    }
+}
+
+/// Returns an upper bound of the bytes of a brick set.
+pub(crate) fn brick_set_bytes(volume: &Volume, needs: &BrickNeeds) -> u64 {
+    let voxels: u64 = volume.lattice.dims.iter().map(|&n| u64::from(n)).product();
+    let sample = match volume.samples {
+        slabcast_common::volume::Samples::U8(_) => 1,
+        slabcast_common::volume::Samples::U16(_) => 2,
+        slabcast_common::volume::Samples::F32(_) => 4,
+    };
+    // A voxel's index within its brick takes up to two bytes.
+    voxels * (2 + sample + 2 * u64::from(needs.normals) + u64::from(needs.gradients))
+}
+
+fn fits(size: [u32; 2], need: u64, most: u64) -> Result<(), InvalidField> {
+    if need <= most {
         return Ok(());
     }
-    let gib = |n: u64| n as f64 / f64::from(1 << 30);
     Err(InvalidField::new(
         "size",
         format!(
-            "{}x{} pixels take the master {:.1} GiB, and it has {:.1} GiB free; give a smaller size",
+            "{}x{} pixels take the master {:.1} GiB, and it has {:.1} GiB for a frame; give a \
+             smaller size",
             size[0],
             size[1],
             gib(need),
-            gib(free)
+            gib(most)
         ),
     ))
 }
 
+fn gib(n: u64) -> f64 {
+    n as f64 / f64::from(1 << 30)
+}
+
+/// Returns bytes for people: `256 MiB`.
+pub(crate) fn mib(n: u64) -> String {
+    format!("{} MiB", n.div_ceil(1 << 20))
+}
+
 /// Returns the bytes that this process may still take: the system's available memory, or the memory
 /// left to its control group if that is less. `None` if neither is known; then nothing is refused.
-fn available() -> Option<u64> {
-    let number = |path: &str| std::fs::read_to_string(path).ok()?.trim().parse::<u64>().ok();
-    let system = std::fs::read_to_string("/proc/meminfo").ok().as_deref().and_then(parse_meminfo);
-    let group = number("/sys/fs/cgroup/memory.max")
-        .zip(number("/sys/fs/cgroup/memory.current"))
-        .map(|(max, current)| max.saturating_sub(current));
-    system.into_iter().chain(group).min()
+pub fn available() -> Option<u64> {
+    let read = |path: &str| std::fs::read_to_string(path).ok();
+    let system = read("/proc/meminfo").as_deref().and_then(parse_meminfo);
+    let number = |path: String| read(&path)?.trim().parse::<u64>().ok();
+    let groups = read("/proc/self/cgroup").unwrap_or_default();
+    // The mount's own root is the group inside of a container.
+    let paths = group_folders(&groups).into_iter().chain([
+        ("/sys/fs/cgroup".to_string(), ["memory.max", "memory.current"]),
+        ("/sys/fs/cgroup/memory".to_string(), ["memory.limit_in_bytes", "memory.usage_in_bytes"]),
+    ]);
+    let left = paths.filter_map(|(folder, [max, used])| {
+        let max = number(format!("{folder}/{max}"))?;
+        Some(max.saturating_sub(number(format!("{folder}/{used}"))?))
+    });
+    system.into_iter().chain(left).min()
+}
+
+/// Returns the folders of the groups of /proc/self/cgroup that limit memory, with the names of
+/// their limit and their use.
+fn group_folders(text: &str) -> Vec<(String, [&'static str; 2])> {
+    let folder = |line: &str| {
+        let mut parts = line.splitn(3, ':').skip(1);
+        let (controllers, path) = (parts.next()?, parts.next()?.trim_end_matches('/'));
+        if controllers.is_empty() {
+            return Some((format!("/sys/fs/cgroup{path}"), ["memory.max", "memory.current"]));
+        }
+        controllers.split(',').any(|c| c == "memory").then(|| {
+            let folder = format!("/sys/fs/cgroup/memory{path}");
+            (folder, ["memory.limit_in_bytes", "memory.usage_in_bytes"])
+        })
+    };
+    text.lines().filter_map(folder).collect()
 }
 
 /// Returns `MemAvailable` of /proc/meminfo in bytes.
@@ -70,21 +188,25 @@ mod tests {
 
     #[test]
     fn picture_beyond_memory_is_refused_with_both_figures() {
-        let e = fits([8192, 8192], PixelFormat::Rgba8, 4 << 30).unwrap_err();
+        let e = fits([8192, 8192], (8192 * 8192) * 68, 4 << 30).unwrap_err();
         assert_eq!(e.field, "size");
         assert_eq!(
             e.problem,
-            "8192x8192 pixels take the master 4.2 GiB, and it has 4.0 GiB free; give a smaller size"
+            "8192x8192 pixels take the master 4.2 GiB, and it has 4.0 GiB for a frame; give a \
+             smaller size"
         );
-        assert!(fits([8192, 8192], PixelFormat::Rgba8, 5 << 30).is_ok());
-        assert!(fits([1, 1], PixelFormat::Rgba32F, 79).is_err());
-        assert!(fits([1, 1], PixelFormat::Rgba32F, 80).is_ok());
+        assert!(fits([8192, 8192], (8192 * 8192) * 68, 5 << 30).is_ok());
+        assert!(fits([1, 1], 80, 79).is_err() && fits([1, 1], 80, 80).is_ok());
     }
 
     #[test]
-    fn only_huge_frames_are_rendered_one_at_a_time() {
-        assert!(beside_others([4096, 4096], PixelFormat::Rgba32F));
-        assert!(!beside_others([8192, 8192], PixelFormat::Rgb8));
+    fn shares_are_parts_of_what_a_master_may_hold() {
+        for bytes in [64 << 20, 512 << 20, 2 << 30, 64 << 30u64] {
+            let s = Shares::of(bytes);
+            let frame = s.largest_frame.unwrap();
+            assert!(frame + s.bricks + s.requests as u64 <= bytes && s.frames <= bytes / 4);
+        }
+        assert_eq!(Shares::of(2 << 30).frames, 256 << 20);
     }
 
     #[test]
@@ -92,5 +214,18 @@ mod tests {
         let text = "MemTotal:       24000000 kB\nMemAvailable:   1024 kB\n";
         assert_eq!(parse_meminfo(text), Some(1 << 20));
         assert_eq!(parse_meminfo("MemTotal: 3 kB\nMemAvailable: some\n"), None);
+        assert_eq!(
+            group_folders("4:cpu,cpuacct:/a\n3:memory:/job\n0::/system.slice/slabcast.service\n"),
+            [
+                (
+                    "/sys/fs/cgroup/memory/job".to_string(),
+                    ["memory.limit_in_bytes", "memory.usage_in_bytes"]
+                ),
+                (
+                    "/sys/fs/cgroup/system.slice/slabcast.service".to_string(),
+                    ["memory.max", "memory.current"]
+                ),
+            ]
+        );
     }
 }

@@ -86,5 +86,6 @@ pub const MAX_BRICKS_MESSAGE: usize = slabcast_common::link::MAX_BRICK_BATCH_BYT
 /// than this for strangers; turntables and several jobs have no such limit.
 pub const MAX_RENDER_MESSAGE: usize = 4 << 20;
 
-/// Largest [`render_v1::WatchFramesResponse`] in bytes, as promised in `render.proto`.
-pub const MAX_FRAME_CHUNK: usize = 1 << 20;
+/// Largest [`render_v1::WatchFramesResponse`] in bytes that a master sends: a quarter of what
+/// `render.proto` promises, since it holds up to three of them for each watcher that reads slowly.
+pub const MAX_FRAME_CHUNK: usize = 1 << 18;

@@ -285,7 +285,7 @@ fn frame_of_any_length_is_cut_into_chunks_and_put_together() {
     assert_eq!(put_together(MAX_FRAME_CHUNK - 256, 1, "[]"), 2);
     assert_eq!(put_together(MAX_FRAME_CHUNK - 255, 1, "[]"), 2);
     let long = "\u{20ac}\"a".repeat(600_000);
-    assert_eq!(put_together(5, 100_000, &long), 6);
+    assert_eq!(put_together(5, 100_000, &long), 24);
 }
 
 /// Statistics of a frame with one slab of so many tiles.

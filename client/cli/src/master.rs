@@ -6,10 +6,12 @@
 
 use crate::systemd::{self, DRAIN};
 use slabcast_master::MasterConfig;
+use slabcast_master::memory::{Shares, available};
 use slabcast_scene::path::Axis;
 use slabcast_session::embedded::start_master;
 use slabcast_session::fail::{Fail, reason, say};
 use slabcast_session::machine::boot_id;
+use slabcast_session::progress::bytes;
 use slabcast_session::request::AxisArgs;
 use slabcast_session::{parse, record, runtime, signals, volume};
 use std::net::SocketAddr;
@@ -26,6 +28,10 @@ Examples:
 
   For workers on other machines, on a network that you trust:
   slabcast master --volume brain.nii.gz --listen 0.0.0.0:7433 --insecure";
+
+/// Least memory that a master takes for itself unless it is told: a frame of 2048x2048 and two
+/// brick sets of mri256.
+const MEMORY: u64 = 512 << 20;
 
 /// Serves a volume to workers and takes jobs from clients.
 #[derive(clap::Args, Clone, Debug)]
@@ -49,6 +55,9 @@ pub(crate) struct MasterArgs {
     #[arg(long,
           value_parser = clap::builder::FalseyValueParser::new())]
     insecure: bool,
+    /// Memory for frames, brick sets and requests, beside the volume [default: half of what is free]
+    #[arg(long, value_name = "BYTES", value_parser = parse::memory)]
+    memory: Option<u64>,
     /// Events and decisions of the scheduler, for `slabcast lab replay`; some 25 KB a frame
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
@@ -69,7 +78,11 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
     let volume = args.input.open(&args.volume)?;
     let (name, lattice) = (volume.name.clone(), volume.lattice);
     let orientation = axes.for_volume(&volume)?;
+    let voxels: u64 = lattice.dims.iter().map(|&n| u64::from(n)).product();
+    let volume_bytes = voxels * volume.samples.kind().bytes() as u64;
     let mut config = MasterConfig::new(volume, orientation);
+    config.shares = shares(args.memory);
+    tell_memory(volume_bytes, &config.shares);
     config.rehearse = args.rehearse;
     config.machine = boot_id();
     if args.rehearse {
@@ -137,6 +150,26 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
     recorded?;
     info!("stopped");
     Ok(())
+}
+
+/// What the master may hold: as it is told, or half of what the machine or the control group has
+/// free now.
+fn shares(memory: Option<u64>) -> Shares {
+    let half = || available().map(|free| (free / 2).max(MEMORY));
+    memory.or_else(half).map_or_else(Shares::default, Shares::of)
+}
+
+/// Says what the master will hold at most.
+fn tell_memory(volume_bytes: u64, shares: &Shares) {
+    let largest = shares.largest_frame.map_or_else(|| "all that is free".into(), bytes);
+    info!(
+        volume = bytes(volume_bytes),
+        frames = bytes(shares.frames),
+        largest_frame = largest,
+        brick_sets = if shares.bricks == u64::MAX { "any".into() } else { bytes(shares.bricks) },
+        requests = bytes(shares.requests as u64),
+        "memory at most"
+    );
 }
 
 /// Takes the address without opening it. Refuses what others can reach, unless `insecure`.

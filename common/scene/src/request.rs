@@ -1,9 +1,10 @@
 //! A job as a client submits it.
 
-use crate::path::ViewPath;
+use crate::path::{Key, PathView, ViewPath};
 use crate::transfer::TransferChoice;
 use slabcast_common::image::{Background, PixelEncoding, PixelFormat};
 use slabcast_common::quality::{Quality, Work};
+use slabcast_common::transfer::TransferFunction;
 
 /// A job as a client submits it.
 #[derive(Clone, Debug, PartialEq)]
@@ -34,4 +35,26 @@ impl PathRequest {
     pub fn encoding(&self) -> PixelEncoding {
         PixelEncoding { format: self.format, background: self.background }
     }
+
+    /// Returns the bytes that the request takes in memory: of views, keys, points and functions, in
+    /// proportion to what was sent, and not to the number of frames.
+    pub fn held_bytes(&self) -> usize {
+        let keys = self.path.keyframes.iter().flat_map(|k| &k.keys);
+        let of_keys = keys
+            .map(|key| size_of::<Key>() + key.tf.as_ref().map_or(0, TransferChoice::held_bytes));
+        let eyes = self.path.flythrough.as_ref().map_or(0, |f| f.eyes.len());
+        size_of::<PathRequest>()
+            + self.client_key.len()
+            + self.path.views.len() * size_of::<PathView>()
+            + of_keys.sum::<usize>()
+            + eyes * size_of::<[f64; 3]>()
+            + self.transfer.held_bytes()
+    }
+}
+
+/// Returns the bytes that a transfer function takes in memory.
+pub fn function_bytes(tf: &TransferFunction) -> usize {
+    size_of::<TransferFunction>()
+        + tf.colors.len() * size_of::<[f64; 4]>()
+        + (tf.opacities.len() + tf.gradient_opacity.len()) * size_of::<[f64; 2]>()
 }

@@ -12,6 +12,16 @@ pub enum TransferChoice {
     Function(Box<TransferFunction>),
 }
 
+impl TransferChoice {
+    /// Returns the bytes that the choice takes in memory beside its own size.
+    pub fn held_bytes(&self) -> usize {
+        match self {
+            TransferChoice::Name(name) => name.len(),
+            TransferChoice::Function(tf) => crate::request::function_bytes(tf),
+        }
+    }
+}
+
 impl Serialize for TransferChoice {
     fn serialize<S: serde::Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
         match self {

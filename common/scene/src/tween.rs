@@ -104,6 +104,11 @@ impl Tween {
         SceneSpec { transfer, quality: Quality { sums, ..base.quality }, ..base.clone() }
     }
 
+    /// Returns the bytes that the functions take in memory.
+    pub fn held_bytes(&self) -> usize {
+        self.key_functions().map(crate::request::function_bytes).sum()
+    }
+
     /// Returns functions whose supports together hold the support of every frame.
     pub fn key_functions(&self) -> impl Iterator<Item = &TransferFunction> {
         // Moving a point from shares to file values rounds it: both count.

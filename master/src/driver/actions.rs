@@ -10,7 +10,7 @@ use slabcast_common::image::{FrameState, SparseTile};
 use slabcast_common::message::ToWorker;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::stats::{FrameStats, PoisonedTile};
-use slabcast_schedule::{Action, Spans};
+use slabcast_schedule::{Action, Event as Happened, Spans};
 use std::sync::Arc;
 use tracing::{debug, info, warn};
 
@@ -28,11 +28,18 @@ impl Driver {
                     }
                 }
                 Action::SendBricks { worker, set, bricks } => {
-                    let store = self.brick_sets.get(set).or_else(|| self.active.store(set));
-                    if let (Some(link), Some(store)) = (self.workers.link(worker), store) {
+                    let Some(link) = self.workers.link(worker) else { continue };
+                    if let Some(store) = self.brick_sets.get(set).cloned() {
                         debug!(%worker, bricks = bricks.len(), "bricks sent");
-                        let store = store.clone();
                         let _ = link.bricks.send(BrickOrder::Send { set, store, bricks });
+                    } else {
+                        // A worker asked for bricks of a frame that ended, and their set has made
+                        // place for another: as if they had come and been forgotten.
+                        let count = bricks.len() as u32;
+                        let came = Happened::BricksIn { worker, set, bricks: count };
+                        self.scheduler.handle(&self.clock, came);
+                        let gone = Happened::BricksForgotten { worker, set, bricks };
+                        self.scheduler.handle(&self.clock, gone);
                     }
                 }
                 Action::Drop { worker, reason } => {
@@ -85,8 +92,7 @@ impl Driver {
         let Some(flight) = self.flights.get_mut(&frame).filter(|_| !self.rehearse) else { return };
         let Some(job) = self.active.get(flight.job) else { return };
         let assembly = flight.assembly.get_or_insert_with(|| {
-            let size = job.views[flight.number as usize].size;
-            Arc::new(Assembly::new(size, job.request.encoding()))
+            Arc::new(Assembly::new(flight.view.size, job.request.encoding()))
         });
         assembly.add(tiles);
         let task = FinishTask::Compose(frame, assembly.clone());
@@ -111,12 +117,12 @@ impl Driver {
             frame,
             request: job.request.clone(),
             scene: flight.scene.clone(),
-            view: job.views[flight.number as usize],
+            view: flight.view,
             state,
             assembly: flight.assembly.clone(),
             stats,
             spans,
-            store: job.store.clone(),
+            store: Some(flight.store.clone()),
             rehearsed: self.rehearse,
         });
         self.push(frame, FinishTask::Finish(sums));
@@ -157,7 +163,7 @@ impl Driver {
         let mut table = self.jobs.lock();
         let is_over = table.put(id, frame);
         let state = table.get(id).map(|job| job.view.state.clone());
-        table.evict(self.frame_budget_bytes, (id, number));
+        table.evict(self.shares.frames as usize, Some((id, number)));
         drop(table);
         if is_over {
             match state {

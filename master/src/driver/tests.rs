@@ -4,11 +4,13 @@ use super::*;
 use crate::handle::{Handle, Master, MasterConfig};
 use crate::hooks::Stage;
 use crate::jobs::WatchItem;
+use crate::memory::making_bytes;
 use crate::panics::caught;
 use slabcast_common::image::{Background, PixelFormat, SparseTile, TilePixels};
 use slabcast_common::message::{Counters, Pixels, RegionCost, TaskTimes, TileResult};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Quality, Work};
+use slabcast_common::transfer::TransferFunction;
 use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
 use slabcast_scene::path::{Orientation, Turntable, ViewPath};
 use slabcast_scene::request::PathRequest;
@@ -19,10 +21,15 @@ use std::sync::{Condvar, Mutex};
 const SIZE: [u32; 2] = [64, 48];
 
 fn master(hooks: Hooks, heartbeat: Micros) -> Master {
+    master_with(hooks, heartbeat, Shares::default())
+}
+
+fn master_with(hooks: Hooks, heartbeat: Micros, shares: Shares) -> Master {
     let volume = Volume::from_fn_u8("v", [24; 3], |i, j, k| (i * 7 + j * 3 + k) as u8);
     let mut config = MasterConfig::new(volume, Orientation::new(None, None).expect("defaults"));
     config.hooks = hooks;
     config.schedule.heartbeat = heartbeat;
+    config.shares = shares;
     Master::start(config).expect("a master")
 }
 
@@ -329,5 +336,161 @@ async fn frame_that_fails_is_told_in_its_place_and_drawn_again_alone() {
     // Nothing is left to be drawn again.
     assert_eq!(handle.submit(request("a", 3, "grey")).await, Ok(job));
     assert!(lent.lock().expect("no panic").is_empty());
+    master.shutdown().await;
+}
+
+/// Waits until the driver has pinged its worker `count` times: it did all that it could do.
+async fn pass(pings: &AtomicUsize, count: usize) {
+    let before = pings.load(Ordering::Relaxed);
+    while pings.load(Ordering::Relaxed) < before + count {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+}
+
+/// Hooks that count how often `stage` begins and hold it until the gate opens.
+fn counted(stage: Stage) -> (Hooks, Gate, Arc<AtomicUsize>) {
+    let (gate, count) = (Gate::default(), Arc::<AtomicUsize>::default());
+    let (held, counts) = (gate.clone(), count.clone());
+    let hooks = Hooks::new(move |reached| {
+        if reached == stage {
+            counts.fetch_add(1, Ordering::Relaxed);
+            held.wait();
+        }
+    });
+    (hooks, gate, count)
+}
+
+/// A path of 100,000 frames costs what its request costs.
+#[tokio::test]
+async fn job_takes_memory_for_its_request_and_not_for_its_frames() {
+    let master = master(Hooks::default(), 1_000_000);
+    let handle = master.handle();
+    let mut held = [0; 2];
+    for (held, (key, frames)) in held.iter_mut().zip([("short", 1), ("long", 100_000)]) {
+        let plan = Plan::new(
+            request(key, frames, "grey"),
+            handle.volume(),
+            &Volume::from_fn_u8("v", [24; 3], |i, j, k| (i * 7 + j * 3 + k) as u8),
+            &Shares::default(),
+        );
+        *held = plan.expect("a good request").held_bytes();
+    }
+    assert!(held[1] < 8192 && held[1].abs_diff(held[0]) < 16, "{held:?} bytes");
+    master.shutdown().await;
+}
+
+/// Four jobs that nobody watches: their frames are made within one budget.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn frames_of_all_jobs_are_made_within_one_budget() {
+    let (hooks, gate, finishing) = counted(Stage::Finish);
+    let one = making_bytes(&request("", 1, "grey"));
+    let shares = Shares { flights: one * 3 / 2, ..Shares::default() };
+    let master = master_with(hooks, 1000, shares);
+    let handle = master.handle();
+    let pings = Arc::<AtomicUsize>::default();
+    join(&handle, pings.clone());
+    let mut jobs = Vec::new();
+    for key in ["a", "b", "c", "d"] {
+        jobs.push(handle.submit(request(key, 3, "grey")).await.expect("a good request"));
+    }
+    while finishing.load(Ordering::Relaxed) == 0 {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    pass(&pings, 20).await;
+    assert_eq!(finishing.load(Ordering::Relaxed), 1, "a second one has no room");
+    gate.open();
+    for job in jobs {
+        assert_eq!(watched(&handle, job).await, (JobState::Done, 3));
+    }
+    master.shutdown().await;
+}
+
+/// Frames that nobody takes fill their half of the budget, and a watcher gets its frames still.
+#[tokio::test]
+async fn frames_that_nobody_takes_stop_no_watcher() {
+    let shares = Shares { frames: 100_000, ..Shares::default() };
+    let master = master_with(Hooks::default(), 1000, shares);
+    let handle = master.handle();
+    let pings = Arc::<AtomicUsize>::default();
+    join(&handle, pings.clone());
+    let mut jobs = Vec::new();
+    for key in ["a", "b", "c"] {
+        jobs.push(handle.submit(request(key, 100, "grey")).await.expect("a good request"));
+    }
+    pass(&pings, 50).await;
+    let done = || jobs.iter().filter_map(|job| handle.job(*job)).map(|job| job.frames_done).sum();
+    let filled: u64 = done();
+    assert!((1..=5).contains(&filled), "{filled} frames of 9 KB and their statistics");
+    assert_eq!(run(&handle, "victim", "grey").await, (JobState::Done, 3));
+    assert_eq!(done(), filled);
+    // From the middle: the frames before are nobody's, and do not come first.
+    let mut watch = handle.watch(jobs[1], 50).expect("it is there");
+    let item = loop {
+        match watch.next().await.expect("a frame") {
+            WatchItem::Frame(frame) => break frame.number,
+            _ => {}
+        }
+    };
+    assert_eq!(item, 50);
+    master.shutdown().await;
+}
+
+/// Eight transfer functions that need eight brick sets: they are cut one after another.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn brick_sets_are_cut_one_at_a_time_and_the_jobs_wait() {
+    let (hooks, gate, cutting) = counted(Stage::CutBricks);
+    let master = master(hooks, 1000);
+    let handle = master.handle();
+    let pings = Arc::<AtomicUsize>::default();
+    join(&handle, pings.clone());
+    let mut jobs = Vec::new();
+    for i in 0..8 {
+        let json = format!(
+            r#"{{"version":1,"domain":"value","colors":[[0,1,1,1]],"opacities":[[{i},0],[{},0.5],[{},0]]}}"#,
+            i + 1,
+            120 + 3 * i
+        );
+        let tf = TransferFunction::from_json(&json).expect("a good function");
+        let request = PathRequest {
+            transfer: TransferChoice::Function(Box::new(tf)),
+            ..request(&i.to_string(), 2, "grey")
+        };
+        jobs.push(handle.submit(request).await.expect("a good request"));
+    }
+    while cutting.load(Ordering::Relaxed) == 0 {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    pass(&pings, 20).await;
+    assert_eq!(cutting.load(Ordering::Relaxed), 1);
+    assert!(handle.jobs().iter().all(|job| job.state == JobState::Preparing));
+    gate.open();
+    for job in jobs {
+        assert_eq!(watched(&handle, job).await, (JobState::Done, 2));
+    }
+    assert_eq!(cutting.load(Ordering::Relaxed), 8);
+    master.shutdown().await;
+}
+
+/// A preview behind a path of 100,000 frames that is watched.
+#[tokio::test]
+async fn one_frame_does_not_wait_for_a_hundred_thousand() {
+    let master = master(Hooks::default(), 1000);
+    let handle = master.handle();
+    let pings = Arc::<AtomicUsize>::default();
+    join(&handle, pings.clone());
+    let long = handle.submit(request("long", 100_000, "grey")).await.expect("a good request");
+    let watching = {
+        let handle = handle.clone();
+        tokio::spawn(async move { watched(&handle, long).await })
+    };
+    while handle.job(long).is_none_or(|job| job.frames_done < 2 * 16) {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    let before = handle.job(long).expect("it is there").frames_done;
+    assert_eq!(run(&handle, "preview", "grey").await, (JobState::Done, 3));
+    let after = handle.job(long).expect("it is there").frames_done;
+    // Those in flight, and as many as end while each of three frames is drawn beside them.
+    assert!(after - before <= 100, "{} frames came before three", after - before);
+    watching.abort();
     master.shutdown().await;
 }

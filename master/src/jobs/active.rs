@@ -1,20 +1,22 @@
 //! Jobs that still have frames to render, or whose frames may be asked for again.
 
 use super::Table;
-use crate::brick_sets::BrickSets;
+use super::submit::Views;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, JobId, SceneId};
 use slabcast_common::message::SceneSpec;
-use slabcast_common::view::View;
 use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_scene::request::PathRequest;
 use slabcast_scene::tween::Tween;
-use slabcast_volumes::BrickStore;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 /// Finished jobs that can be watched again from the start without being submitted anew.
 const RENDERABLE_WHEN_DONE: usize = 4;
+
+/// Frames of a job after which it first comes behind others. At half, a preview of a turn loses its
+/// place before it is done; at twice this, one frame waits for 32 of each job before it.
+const FIRST_TURN: u64 = 16;
 
 /// A job with all that its frames are rendered from.
 pub(crate) struct ActiveJob {
@@ -22,13 +24,22 @@ pub(crate) struct ActiveJob {
     /// The scene of all frames; of a tween, all but the transfer function.
     pub(crate) scene: Arc<SceneSpec>,
     pub(crate) tween: Option<Tween>,
-    pub(crate) wanted: BrickNeeds,
-    /// One view a frame.
-    pub(crate) views: Vec<View>,
-    /// Bricks of the job, once they are cut.
-    pub(crate) store: Option<Arc<BrickStore>>,
-    /// The next frame that was never rendered.
+    /// What the job's brick set holds: what it needs, or more.
+    pub(crate) bricks: BrickNeeds,
+    pub(crate) views: Views,
+    /// The next frame that was never rendered, or one before it.
     pub(crate) next: u64,
+    /// How many frames of it were begun, those that were rendered again included.
+    pub(crate) begun: u64,
+}
+
+/// A frame that may be begun next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Candidate {
+    pub(crate) job: JobId,
+    pub(crate) number: u64,
+    /// Whether a watcher waits for it; else it is drawn ahead.
+    pub(crate) wanted: bool,
 }
 
 /// Bit of the ids of scenes of a tween's single frames, beside the frame's id. Ids of jobs' scenes
@@ -36,6 +47,13 @@ pub(crate) struct ActiveJob {
 const SINGLE_FRAME: u64 = 1 << 63;
 
 impl ActiveJob {
+    /// The turn that the job is in: the first of [`FIRST_TURN`] frames, each as long as all before
+    /// it. Jobs in earlier turns come first, so that one frame need not wait for 100,000; and since
+    /// turns grow, jobs that need brick sets of their own seldom take turns.
+    fn turn(&self) -> u32 {
+        (self.begun / FIRST_TURN + 1).ilog2()
+    }
+
     /// The scene of frame `number`, which the scheduler knows as `frame`. Each frame of a tween is
     /// a scene of its own on the same bricks.
     pub(crate) fn scene_of(&self, number: u64, frame: FrameId) -> Arc<SceneSpec> {
@@ -76,60 +94,42 @@ impl ActiveJobs {
         self.by_id.contains_key(&id)
     }
 
-    pub(crate) fn len(&self) -> usize {
-        self.order.len()
-    }
-
     /// Ids, oldest first.
     pub(crate) fn ids(&self) -> impl Iterator<Item = JobId> {
         self.order.iter().copied()
     }
 
-    /// Whether a job draws from the bricks of this set.
-    pub(crate) fn needs(&self, bricks: BrickSetKey) -> bool {
-        self.by_id.values().any(|job| job.scene.bricks == bricks)
+    /// Whether a job that is not over draws from the bricks of this set.
+    pub(crate) fn open_need(&self, table: &Table, bricks: BrickSetKey) -> bool {
+        let is_open = |id: &JobId| table.get(*id).is_some_and(|job| !job.view.state.is_over());
+        self.by_id.iter().any(|(id, job)| job.scene.bricks == bricks && is_open(id))
     }
 
-    /// The bricks of this set, if a job holds them.
-    pub(crate) fn store(&self, key: BrickSetKey) -> Option<&Arc<BrickStore>> {
-        self.by_id.values().find_map(|job| job.store.as_ref().filter(|s| s.key() == key))
-    }
-
-    /// Gives jobs without bricks those that were cut for another job meanwhile.
-    pub(crate) fn share_bricks(&mut self, sets: &BrickSets) {
-        for job in self.by_id.values_mut().filter(|job| job.store.is_none()) {
-            let set = sets.get(job.scene.bricks);
-            job.store = set.filter(|s| s.needs().covers(&job.wanted)).cloned();
-        }
-    }
-
-    /// The next frame to render: the oldest job's, unless its untaken frames fill the budget.
-    /// `is_in_flight` tells of frames that are being rendered.
-    pub(crate) fn next_frame(
+    /// The frame that each job would begin next, in the order of their turns: one that a watcher
+    /// waits for, or else the next that was never rendered. Within a turn, frames that are waited
+    /// for come first, and older jobs. `is_in_flight` tells of frames that are being rendered.
+    pub(crate) fn candidates(
         &self,
         table: &Table,
-        budget_bytes: usize,
         is_in_flight: impl Fn(JobId, u64) -> bool,
-    ) -> Option<(JobId, u64)> {
-        let has_room = table.untaken_bytes() < budget_bytes;
-        for id in &self.order {
-            let (Some(active), Some(job)) = (self.by_id.get(id), table.get(*id)) else { continue };
-            if active.store.is_none() {
-                continue;
+    ) -> Vec<Candidate> {
+        let next = |id: JobId, active: &ActiveJob| {
+            let (job, total) = (table.get(id)?, active.views.len());
+            if let Some(number) = job.missing().find(|&n| n < total && !is_in_flight(id, n)) {
+                return Some(Candidate { job: id, number, wanted: true });
             }
-            let again = job.wanted_again.iter().copied().find(|n| !is_in_flight(*id, *n));
-            if let Some(number) = again {
-                return Some((*id, number));
-            }
-            let retried = job.retried.iter().copied().find(|n| !is_in_flight(*id, *n));
-            if let Some(number) = retried.filter(|_| has_room || !job.has_untaken()) {
-                return Some((*id, number));
-            }
-            if active.next < active.views.len() as u64 && (has_room || !job.has_untaken()) {
-                return Some((*id, active.next));
-            }
-        }
-        None
+            let is_new = |n: &u64| !job.has_ended(*n) && !is_in_flight(id, *n);
+            let retried = job.retried.iter().copied().find(|&n| !is_in_flight(id, n));
+            let number = retried.or_else(|| (active.next..total).find(is_new))?;
+            Some(Candidate { job: id, number, wanted: false })
+        };
+        let jobs = self.order.iter().filter_map(|&id| {
+            let active = self.by_id.get(&id)?;
+            Some((active.turn(), next(id, active)?))
+        });
+        let mut candidates: Vec<(u32, Candidate)> = jobs.collect();
+        candidates.sort_by_key(|(turn, candidate)| (*turn, !candidate.wanted));
+        candidates.into_iter().map(|(_, candidate)| candidate).collect()
     }
 
     /// Jobs that are over and whose frames are no longer rendered again: all but the last

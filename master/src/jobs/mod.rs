@@ -2,11 +2,15 @@
 //!
 //! The table is shared: the driver puts frames in, watchers take them out. A watcher is a cursor,
 //! so that it may come late, twice, or again after its connection broke. Frames that no watcher has
-//! taken are never dropped; instead the driver stops rendering ahead when they fill the budget
-//! (back-pressure). Frames that were taken are kept while there is room, and rendered again when a
-//! watcher asks for one that was dropped: a frame is a pure function of its job.
+//! taken are never dropped while their job runs; instead the driver stops rendering ahead when they
+//! fill their half of the budget (back-pressure). The other half is for frames that a watcher waits
+//! for, so that frames which nobody takes stop nobody. Frames that were taken are kept while there
+//! is room, and rendered again when a watcher asks for one that was dropped: a frame is a pure
+//! function of its job. So a watcher that reads slowly holds its frame for [`IN_HAND`] and no
+//! longer.
 
 pub(crate) mod active;
+mod numbers;
 pub mod submit;
 #[cfg(test)]
 mod tests;
@@ -15,7 +19,9 @@ mod watcher;
 pub use watcher::{Watch, WatchItem};
 
 use crate::handle::unix_ms;
+use crate::memory::mib;
 use bytes::Bytes;
+use numbers::Numbers;
 use slabcast_common::ids::JobId;
 use slabcast_common::image::PixelFormat;
 use slabcast_common::stats::FrameStats;
@@ -23,13 +29,23 @@ use slabcast_scene::path::Framing;
 use slabcast_scene::request::PathRequest;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+use submit::SubmitError;
 use tokio::sync::watch;
+use tokio::time::Instant;
 
 /// Most jobs that a master remembers. Beyond it, the oldest jobs that are over are forgotten.
 pub const MAX_JOBS: usize = 1000;
 
 /// Reasons of failed frames that a job keeps; later failures are told by the last of them.
 const MAX_REASONS: usize = 100;
+/// Most jobs in progress.
+const MAX_OPEN_JOBS: usize = 200;
+
+/// Time for which a frame that a watcher took is not dropped for others'. A frame of 256 MiB takes
+/// 2 s over a gigabit. At half, such a watcher has it drawn twice; at twice this, a reader that
+/// stalls keeps others waiting for as long.
+pub(crate) const IN_HAND: Duration = Duration::from_secs(5);
 
 /// State of a job, from its queue to its end.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -58,6 +74,11 @@ impl JobState {
     pub fn is_over(&self) -> bool {
         use JobState::*;
         matches!(self, Done | Incomplete(_) | Failed(_) | Cancelled)
+    }
+
+    /// Whether frames of such a job are still rendered, or rendered again.
+    pub(crate) fn may_render(&self) -> bool {
+        !matches!(self, JobState::Failed(_) | JobState::Cancelled)
     }
 }
 
@@ -113,43 +134,71 @@ pub struct FinishedFrame {
     pub trace_json: Option<String>,
 }
 
+impl FinishedFrame {
+    /// Bytes that the frame takes: pixels, statistics in both forms, spans.
+    pub(crate) fn held_bytes(&self) -> usize {
+        // Statistics take as structures some two times what they take as text.
+        let trace = self.trace_json.as_ref().map_or(0, String::len);
+        self.bytes.len() + 3 * self.stats_json.len() + trace
+    }
+}
+
+/// A frame that the table keeps.
+struct Kept {
+    frame: Arc<FinishedFrame>,
+    bytes: usize,
+    /// Whether a watcher has taken it.
+    taken: bool,
+}
+
 /// A job in the table.
 pub(crate) struct Job {
     pub(crate) view: JobView,
     pub(crate) request: Arc<PathRequest>,
     /// Frames that are kept, by number.
-    frames: BTreeMap<u64, Arc<FinishedFrame>>,
+    frames: BTreeMap<u64, Kept>,
     /// Numbers of frames that were finished at least once.
-    ever_done: BTreeSet<u64>,
-    /// Numbers of frames that a watcher has taken since they were finished last.
-    taken: BTreeSet<u64>,
-    /// Number and bytes of the kept frames that are not in `taken`.
+    ever_done: Numbers,
+    /// Number and bytes of the kept frames that no watcher has taken.
     untaken: (usize, usize),
-    /// Numbers of frames that were dropped and are asked for again.
-    pub(crate) wanted_again: BTreeSet<u64>,
     /// Frames that failed, and why.
     failed: BTreeMap<u64, Arc<str>>,
     /// Numbers of frames that failed and are to be drawn again.
     pub(crate) retried: BTreeSet<u64>,
+    /// Numbers of frames that watchers wait for now, and how many do.
+    waiting: BTreeMap<u64, u32>,
+    /// Bytes that the request takes with all that was made of it.
+    held_bytes: usize,
     /// Whether frames that were dropped can't be rendered again.
     retired: bool,
 }
 
 impl Job {
-    /// A job without frames.
-    pub(crate) fn new(view: JobView, request: Arc<PathRequest>) -> Job {
+    /// A job without frames, whose request takes `held_bytes` with all that was made of it.
+    pub(crate) fn new(view: JobView, request: Arc<PathRequest>, held_bytes: usize) -> Job {
         Job {
             view,
             request,
             frames: BTreeMap::new(),
-            ever_done: BTreeSet::new(),
-            taken: BTreeSet::new(),
+            ever_done: Numbers::default(),
             untaken: (0, 0),
-            wanted_again: BTreeSet::new(),
             failed: BTreeMap::new(),
             retried: BTreeSet::new(),
+            waiting: BTreeMap::new(),
+            held_bytes,
             retired: false,
         }
+    }
+
+    /// The frames that watchers wait for and that are not there, lowest first.
+    pub(crate) fn missing(&self) -> impl Iterator<Item = u64> {
+        let is_there = |n: &u64| self.frames.contains_key(n) || self.failed.contains_key(n);
+        self.waiting.keys().copied().filter(move |n| !is_there(n))
+    }
+
+    /// Whether a frame was finished at least once, or failed.
+    pub(crate) fn has_ended(&self, number: u64) -> bool {
+        self.ever_done.contains(number) || self.failed.contains_key(&number)
     }
 
     /// Returns the first frame from `number` on whose pixels are kept.
@@ -164,8 +213,8 @@ impl Job {
 
     /// The end of the job, if all its frames have come to one.
     fn end(&self) -> Option<JobState> {
-        let ended = self.ever_done.len() + self.failed.len();
-        if (ended as u64) < self.view.frames_total || self.view.state.is_over() {
+        let ended = self.ever_done.len() + self.failed.len() as u64;
+        if ended < self.view.frames_total || self.view.state.is_over() {
             return None;
         }
         let Some((number, reason)) = self.failed.first_key_value() else {
@@ -178,13 +227,8 @@ impl Job {
     }
 
     fn count(&mut self) {
-        self.view.frames_done = self.ever_done.len() as u64;
+        self.view.frames_done = self.ever_done.len();
         self.view.frames_failed = self.failed.len() as u64;
-    }
-
-    /// Whether it keeps a frame that nobody has taken.
-    pub(crate) fn has_untaken(&self) -> bool {
-        self.untaken.0 > 0
     }
 
     fn count_untaken(&mut self, bytes: usize) {
@@ -211,6 +255,13 @@ pub(crate) struct Table {
     bytes: usize,
     /// Bytes of those that nobody has taken, of jobs that are not over.
     untaken_bytes: usize,
+    /// Bytes of all jobs' requests, and how many there may be.
+    held_bytes: usize,
+    most_held_bytes: usize,
+    /// Bytes of each request that is being checked.
+    checking: Vec<usize>,
+    /// Frames that watchers took and have not sent on: how many hold one, and until when it stays.
+    in_hand: BTreeMap<(JobId, u64), (u32, Instant)>,
 }
 
 impl Table {
@@ -241,11 +292,45 @@ impl Table {
         JobId(self.last_id)
     }
 
-    /// Adds a job. Forgets the oldest jobs that are over beyond [`MAX_JOBS`].
+    /// Checks that there is a place for a job whose request takes `bytes`.
+    ///
+    /// # Errors
+    /// [`SubmitError::Full`] with the figures.
+    pub(crate) fn has_place(&self, bytes: usize) -> Result<(), SubmitError> {
+        let open = self.jobs.values().filter(|job| !job.view.state.is_over());
+        self.has_place_among(open.map(|job| job.held_bytes), bytes)
+    }
+
+    fn has_place_among(
+        &self,
+        others: impl Iterator<Item = usize>,
+        bytes: usize,
+    ) -> Result<(), SubmitError> {
+        let (jobs, held) = others.fold((0, 0), |(n, held), bytes| (n + 1, held + bytes));
+        if jobs >= MAX_OPEN_JOBS {
+            return Err(SubmitError::Full(format!(
+                "the master has {jobs} jobs in progress, as many as it takes; wait, or cancel one"
+            )));
+        }
+        if held + bytes > self.most_held_bytes {
+            return Err(SubmitError::Full(format!(
+                "the requests of the {jobs} jobs in progress take {}, this one {}, and the master \
+                 has {} for them; wait, or submit the path in parts",
+                mib(held as u64),
+                mib(bytes as u64),
+                mib(self.most_held_bytes as u64)
+            )));
+        }
+        Ok(())
+    }
+
+    /// Adds a job. Forgets the oldest jobs that are over beyond [`MAX_JOBS`] and beyond the bytes
+    /// that requests may take.
     pub(crate) fn insert(&mut self, job: Job) {
         self.by_key.insert(job.view.client_key.clone(), job.view.id);
+        self.held_bytes += job.held_bytes;
         self.jobs.insert(job.view.id, job);
-        while self.jobs.len() > MAX_JOBS {
+        while self.jobs.len() > MAX_JOBS || self.held_bytes > self.most_held_bytes {
             let Some(id) =
                 self.jobs.iter().find(|(_, j)| j.view.state.is_over()).map(|(id, _)| *id)
             else {
@@ -253,7 +338,8 @@ impl Table {
             };
             if let Some(job) = self.jobs.remove(&id) {
                 self.by_key.remove(&job.view.client_key);
-                self.bytes -= job.frames.values().map(|f| f.bytes.len()).sum::<usize>();
+                self.bytes -= job.frames.values().map(|f| f.bytes).sum::<usize>();
+                self.held_bytes -= job.held_bytes;
             }
         }
     }
@@ -282,15 +368,14 @@ impl Table {
     /// then, in one step with its last frame, so that whoever sees that frame sees the state.
     pub(crate) fn put(&mut self, id: JobId, frame: FinishedFrame) -> bool {
         let Some(job) = self.jobs.get_mut(&id) else { return false };
-        let (number, bytes) = (frame.number, frame.bytes.len());
+        let (number, bytes) = (frame.number, frame.held_bytes());
         let is_open = !job.view.state.is_over();
-        let was_taken = job.taken.remove(&number);
-        if let Some(before) = job.frames.insert(number, Arc::new(frame)) {
-            let before = before.bytes.len();
-            self.bytes -= before;
-            if !was_taken {
-                job.discount_untaken(before);
-                self.untaken_bytes -= if is_open { before } else { 0 };
+        let kept = Kept { frame: Arc::new(frame), bytes, taken: false };
+        if let Some(before) = job.frames.insert(number, kept) {
+            self.bytes -= before.bytes;
+            if !before.taken {
+                job.discount_untaken(before.bytes);
+                self.untaken_bytes -= if is_open { before.bytes } else { 0 };
             }
         }
         self.bytes += bytes;
@@ -317,8 +402,7 @@ impl Table {
         };
         job.failed.insert(number, reason);
         // It may have been drawn, dropped and asked for again.
-        job.ever_done.remove(&number);
-        job.wanted_again.remove(&number);
+        job.ever_done.remove(number);
         job.retried.remove(&number);
         job.count();
         let end = job.end();
@@ -344,33 +428,62 @@ impl Table {
         job.retried.len()
     }
 
-    /// Takes a frame for a watcher; the table keeps it.
+    /// Takes a frame for a watcher; the table keeps it, for [`IN_HAND`] at least unless the watcher
+    /// puts it back before ([`Table::put_back`]).
     fn take(&mut self, id: JobId, number: u64) -> Option<Arc<FinishedFrame>> {
-        let job = self.jobs.get_mut(&id)?;
-        let frame = job.frames.get(&number)?.clone();
-        if job.taken.insert(number) {
-            job.discount_untaken(frame.bytes.len());
-            if !job.view.state.is_over() {
-                self.untaken_bytes -= frame.bytes.len();
-            }
-        }
-        job.wanted_again.remove(&number);
+        let frame = self.look_at(id, number)?;
+        let hand = self.in_hand.entry((id, number)).or_insert((0, Instant::now()));
+        *hand = (hand.0 + 1, Instant::now() + IN_HAND);
         Some(frame)
     }
 
-    /// Asks for a frame again if it was finished and dropped. True if that is new.
-    fn want_again(&mut self, id: JobId, number: u64) -> bool {
-        let Some(job) = self.jobs.get_mut(&id) else { return false };
-        job.ever_done.contains(&number)
-            && !job.frames.contains_key(&number)
-            && job.wanted_again.insert(number)
+    /// Takes a frame without holding on to it.
+    fn look_at(&mut self, id: JobId, number: u64) -> Option<Arc<FinishedFrame>> {
+        let job = self.jobs.get_mut(&id)?;
+        let kept = job.frames.get_mut(&number)?;
+        let (frame, bytes) = (kept.frame.clone(), kept.bytes);
+        if !std::mem::replace(&mut kept.taken, true) {
+            job.discount_untaken(bytes);
+            if !job.view.state.is_over() {
+                self.untaken_bytes -= bytes;
+            }
+        }
+        Some(frame)
     }
 
-    /// Notes that a frame is being rendered again.
-    pub(crate) fn rendering_again(&mut self, id: JobId, number: u64) {
+    /// Notes that a frame is being rendered.
+    pub(crate) fn begins(&mut self, id: JobId, number: u64) {
         if let Some(job) = self.jobs.get_mut(&id) {
-            job.wanted_again.remove(&number);
             job.retried.remove(&number);
+        }
+    }
+
+    /// Notes that a watcher no longer needs a frame that it took.
+    fn put_back(&mut self, id: JobId, number: u64) {
+        if let Some(hand) = self.in_hand.get_mut(&(id, number)) {
+            hand.0 -= 1;
+            if hand.0 == 0 {
+                self.in_hand.remove(&(id, number));
+            }
+        }
+    }
+
+    /// Notes that a watcher waits for a frame. True if the frame is not there, so that somebody has
+    /// to be told.
+    fn wait_for(&mut self, id: JobId, number: u64) -> bool {
+        let Some(job) = self.jobs.get_mut(&id) else { return false };
+        *job.waiting.entry(number).or_insert(0) += 1;
+        !job.frames.contains_key(&number)
+    }
+
+    /// Notes that a watcher waits no longer for a frame.
+    fn waits_no_more(&mut self, id: JobId, number: u64) {
+        let Some(job) = self.jobs.get_mut(&id) else { return };
+        if let Some(watchers) = job.waiting.get_mut(&number) {
+            *watchers -= 1;
+            if *watchers == 0 {
+                job.waiting.remove(&number);
+            }
         }
     }
 
@@ -379,31 +492,46 @@ impl Table {
         self.untaken_bytes
     }
 
+    /// Bytes of frames that watchers hold and that may not be dropped yet.
+    pub(crate) fn in_hand_bytes(&self) -> usize {
+        let now = Instant::now();
+        let held = self.in_hand.iter().filter(|(_, (_, until))| *until > now);
+        let kept = held.filter_map(|((id, n), _)| self.jobs.get(id)?.frames.get(n));
+        kept.map(|kept| kept.bytes).sum()
+    }
+
     /// Drops frames until `budget_bytes` holds, oldest jobs and lowest numbers first: those that
     /// were taken, then those of jobs that are over. A frame of a job in progress that nobody has
-    /// taken stays; so does `newest`, which came just now, until the next one comes. Else a frame
-    /// larger than the budget would be dropped before its watcher sees it, asked for again,
-    /// rendered again and dropped again, for ever.
-    pub(crate) fn evict(&mut self, budget_bytes: usize, newest: (JobId, u64)) {
+    /// taken stays, and so does one that a watcher has in hand or waits for. `newest`, which came
+    /// just now, stays until the next one comes. Else a frame larger than the budget would be
+    /// dropped before its watcher sees it, asked for again, rendered again and dropped again, for
+    /// ever.
+    pub(crate) fn evict(&mut self, budget_bytes: usize, newest: Option<(JobId, u64)>) {
+        let now = Instant::now();
         for over_too in [false, true] {
             for (id, job) in &mut self.jobs {
                 if self.bytes <= budget_bytes {
                     return;
                 }
                 let is_over = job.view.state.is_over();
-                let may_go = |n: &u64| {
-                    (*id, *n) != newest && (job.taken.contains(n) || (over_too && is_over))
+                let in_hand = &self.in_hand;
+                let may_go = |n: u64, kept: &Kept| {
+                    Some((*id, n)) != newest
+                        && !job.waiting.contains_key(&n)
+                        && in_hand.get(&(*id, n)).is_none_or(|(_, until)| *until <= now)
+                        && (kept.taken || (over_too && is_over))
                 };
-                let droppable: Vec<u64> = job.frames.keys().copied().filter(may_go).collect();
+                let droppable: Vec<u64> =
+                    job.frames.iter().filter(|(n, kept)| may_go(**n, kept)).map(|f| *f.0).collect();
                 for number in droppable {
                     if self.bytes <= budget_bytes {
                         return;
                     }
-                    let Some(frame) = job.frames.remove(&number) else { continue };
-                    self.bytes -= frame.bytes.len();
-                    if !job.taken.contains(&number) {
+                    let Some(kept) = job.frames.remove(&number) else { continue };
+                    self.bytes -= kept.bytes;
+                    if !kept.taken {
                         // The job is over, so the table does not count it.
-                        job.discount_untaken(frame.bytes.len());
+                        job.discount_untaken(kept.bytes);
                     }
                 }
             }
@@ -419,9 +547,10 @@ pub(crate) struct Jobs {
 }
 
 impl Jobs {
-    /// A table whose first job has the id `last_id + 1`.
-    pub(crate) fn starting_after(last_id: u64) -> Self {
-        let table = Table { last_id, ..Table::default() };
+    /// A table whose first job has the id `last_id + 1`, and whose jobs' requests may take
+    /// `most_held_bytes`.
+    pub(crate) fn new(last_id: u64, most_held_bytes: usize) -> Self {
+        let table = Table { last_id, most_held_bytes, ..Table::default() };
         let [bell, tile_bell] = [(); 2].map(|()| watch::channel(0).0);
         Jobs { table: Mutex::new(table), bell, tile_bell }
     }
@@ -429,6 +558,20 @@ impl Jobs {
     /// Locks the table: for moments only, never across an await.
     pub(crate) fn lock(&self) -> MutexGuard<'_, Table> {
         self.table.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Reserves a place for a request of `bytes` while it is checked: decoded requests would pile up
+    /// before the check otherwise, 70 times as large as they came.
+    ///
+    /// # Errors
+    /// [`SubmitError::Full`] with the figures.
+    pub(crate) fn reserve(self: &Arc<Self>, bytes: usize) -> Result<Checking, SubmitError> {
+        let mut table = self.lock();
+        let open = table.jobs.values().filter(|job| !job.view.state.is_over());
+        let others = open.map(|job| job.held_bytes).chain(table.checking.iter().copied());
+        table.has_place_among(others, bytes)?;
+        table.checking.push(bytes);
+        Ok(Checking { jobs: self.clone(), bytes })
     }
 
     /// Wakes the watchers.
@@ -445,5 +588,20 @@ impl Jobs {
     /// Receivers of both bells.
     fn listen(&self) -> (watch::Receiver<u64>, watch::Receiver<u64>) {
         (self.bell.subscribe(), self.tile_bell.subscribe())
+    }
+}
+
+/// A place of a request that is being checked, from [`Jobs::reserve`].
+pub(crate) struct Checking {
+    jobs: Arc<Jobs>,
+    bytes: usize,
+}
+
+impl Drop for Checking {
+    fn drop(&mut self) {
+        let mut table = self.jobs.lock();
+        if let Some(i) = table.checking.iter().position(|bytes| *bytes == self.bytes) {
+            table.checking.swap_remove(i);
+        }
     }
 }

@@ -1,14 +1,14 @@
 //! From a request to a job: everything that is checked and computed before its first frame.
 //!
-//! A path may have 100,000 views. Working them out takes longer than the driver may be away from
-//! its heartbeats, so `Plan::new` runs on a thread of the caller's runtime
+//! A path may have 100,000 views in 76 bytes. They are made one by one as their frames are drawn, so
+//! that a job takes what its request takes. Checking it may still take longer than the driver may
+//! be away from its heartbeats, so `Plan::new` runs on a thread of the caller's runtime
 //! ([`crate::Handle::submit`]) and the driver gets the finished plan.
 
 use super::active::ActiveJob;
 use super::{Job, JobState, JobView};
 use crate::handle::{ServedVolume, unix_ms};
-use crate::memory;
-use slabcast_common::brick::BrickSetKey;
+use crate::memory::Shares;
 use slabcast_common::ids::{JobId, SceneId};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{InvalidField, Quality};
@@ -16,17 +16,21 @@ use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_scene::brick_needs::BrickNeeds;
-use slabcast_scene::path::Framing;
+use slabcast_scene::path::{Framing, Prepared, ViewPath};
 use slabcast_scene::presets;
-use slabcast_scene::request::PathRequest;
+use slabcast_scene::request::{PathRequest, function_bytes};
 use slabcast_scene::transfer::TransferChoice;
 use slabcast_scene::tween::Tween;
-use slabcast_volumes::BrickStore;
 use slabcast_volumes::framing::framing;
 use std::sync::Arc;
 
 /// Bytes of the longest `client_key`.
 const MAX_KEY_BYTES: usize = 200;
+
+/// Views of a path that are tried before it is accepted, evenly spread over it; views that were
+/// given one by one are all tried. A view takes 1 us, so that a path of 100,000 frames would take
+/// 0.1 s for a request of 76 bytes. A frame in between that can't be drawn fails its job by name.
+const TRIED_VIEWS: usize = 1000;
 
 /// Reason why a request did not become a job.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -37,9 +41,10 @@ pub enum SubmitError {
     /// The client's key belongs to another request.
     #[error("client_key: belongs to another request; choose a fresh key")]
     KeyTaken,
-    /// The master has as many jobs in progress as it takes.
-    #[error("the master has as many jobs as it takes; wait, or cancel one")]
-    Full,
+    /// The master has as many jobs in progress as it takes, or as much memory in use for them; the
+    /// figures, and what to do.
+    #[error("{0}")]
+    Full(String),
     /// The master is shutting down.
     #[error("the master is shutting down")]
     Gone,
@@ -55,8 +60,55 @@ pub(crate) struct Plan {
     transfer: TransferFunction,
     quality: Quality,
     tween: Option<Tween>,
-    views: Vec<View>,
+    views: Views,
     framing: Option<Framing>,
+}
+
+/// The views of a path, each made when it is asked for.
+pub(crate) struct Views {
+    request: Arc<PathRequest>,
+    /// The path with the numbers of its framing, if it asked for them.
+    framed: Option<Box<ViewPath>>,
+    prepared: Prepared,
+}
+
+impl Views {
+    fn path(&self) -> &ViewPath {
+        self.framed.as_deref().unwrap_or(&self.request.path)
+    }
+
+    /// The number of views.
+    pub(crate) fn len(&self) -> u64 {
+        self.request.path.frames() as u64
+    }
+
+    /// Makes a view of the volume `info`.
+    ///
+    /// # Errors
+    /// The field of the camera that can't be used.
+    pub(crate) fn view(&self, number: u64, info: &VolumeInfo) -> Result<View, InvalidField> {
+        let camera = self.prepared.camera(self.path(), number as usize)?;
+        View::new(&info.lattice, &camera, self.request.path.size, &self.request.quality)
+    }
+
+    /// Tries views: all that were given, else [`TRIED_VIEWS`] of the path.
+    fn check(&self, info: &VolumeInfo) -> Result<(), InvalidField> {
+        let last = self.len() - 1;
+        let tried = if self.path().views.is_empty() {
+            self.len().min(TRIED_VIEWS as u64)
+        } else {
+            self.len()
+        };
+        (0..tried).try_for_each(|i| {
+            let number = if tried > 1 { i * last / (tried - 1) } else { 0 };
+            self.view(number, info).map(drop)
+        })
+    }
+
+    fn held_bytes(&self) -> usize {
+        let framed = self.framed.as_ref().map_or(0, |_| self.request.held_bytes());
+        self.prepared.held_bytes() + framed
+    }
 }
 
 /// Checks a client's key.
@@ -77,12 +129,13 @@ impl Plan {
         request: PathRequest,
         served: &ServedVolume,
         volume: &Volume,
+        shares: &Shares,
     ) -> Result<Plan, InvalidField> {
         let info = &served.info;
         request.quality.check()?;
         request.work.check()?;
         request.path.check()?;
-        memory::check(request.path.size, request.format)?;
+        shares.check(&request)?;
         let transfer: TransferFunction = match &request.transfer {
             TransferChoice::Name(name) => presets::by_name(name, &info.summary)?,
             TransferChoice::Function(tf) => {
@@ -91,15 +144,13 @@ impl Plan {
             }
         };
         let framing = framing(&request.path, volume, info, &transfer, served.orientation)?;
+        let request = Arc::new(request);
         // The request stays as it came: the same key has to mean the same request.
-        let path =
-            framing.as_ref().map_or_else(|| request.path.clone(), |f| request.path.framed(f));
-        let cameras = path.prepare(&info.lattice, served.orientation)?;
-        let views = (0..request.path.frames())
-            .map(|i| {
-                View::new(&info.lattice, &cameras.camera(i)?, request.path.size, &request.quality)
-            })
-            .collect::<Result<Vec<View>, InvalidField>>()?;
+        let framed = framing.as_ref().map(|f| Box::new(request.path.framed(f)));
+        let path = framed.as_deref().unwrap_or(&request.path);
+        let prepared = path.prepare(&info.lattice, served.orientation)?.into_prepared();
+        let views = Views { request: request.clone(), framed, prepared };
+        views.check(info)?;
         let compositing = request.quality.compositing;
         let tween = Tween::from_path(&request.path, &info.summary)?;
         let mut sums = request.quality.sums;
@@ -111,7 +162,6 @@ impl Plan {
         let wanted =
             BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, &quality)?
                 .with_kept(request.work.keep);
-        let request = Arc::new(request);
         Ok(Plan { request, wanted, transfer, quality, tween, views, framing })
     }
 
@@ -125,7 +175,7 @@ impl Plan {
                 state: JobState::Queued,
                 frames_done: 0,
                 frames_failed: 0,
-                frames_total: self.views.len() as u64,
+                frames_total: self.views.len(),
                 tiles: (0, 0),
                 slab: (0, 0),
                 workers: 0,
@@ -136,22 +186,29 @@ impl Plan {
                 finished_unix_ms: 0,
             },
             request,
+            self.held_bytes(),
         )
     }
 
-    /// The job as the driver renders it. `store`: its bricks, if they are there; else they will
-    /// have the key `bricks`.
-    pub(crate) fn activate(
-        self,
-        id: JobId,
-        volume: VolumeInfo,
-        bricks: BrickSetKey,
-        store: Option<Arc<BrickStore>>,
-    ) -> ActiveJob {
+    /// Bytes that the request takes with all that was made of it: in proportion to what was sent,
+    /// and not to the number of frames.
+    pub(crate) fn held_bytes(&self) -> usize {
+        size_of::<ActiveJob>()
+            + size_of::<Job>()
+            + size_of::<SceneSpec>()
+            + self.request.held_bytes()
+            + self.views.held_bytes()
+            + function_bytes(&self.transfer)
+            + self.tween.as_ref().map_or(0, Tween::held_bytes)
+            + self.wanted.support.intervals.len() * size_of::<(f64, f64)>()
+    }
+
+    /// The job as the driver renders it, from bricks with the needs `bricks`.
+    pub(crate) fn activate(self, id: JobId, volume: VolumeInfo, bricks: BrickNeeds) -> ActiveJob {
         let Plan { request, wanted, transfer, quality, tween, views, framing: _ } = self;
-        let crop = wanted.crop;
-        let scene = SceneSpec { id: SceneId(id.0), volume, transfer, quality, crop, bricks };
-        ActiveJob { request, scene: Arc::new(scene), tween, wanted, views, store, next: 0 }
+        let (crop, key) = (wanted.crop, bricks.set_key(volume.digest));
+        let scene = SceneSpec { id: SceneId(id.0), volume, transfer, quality, crop, bricks: key };
+        ActiveJob { request, scene: Arc::new(scene), tween, bricks, views, next: 0, begun: 0 }
     }
 
     /// The sums that frames are drawn with.

@@ -78,12 +78,12 @@ fn job(id: JobId, frames: u64) -> Job {
         submitted_unix_ms: 0,
         finished_unix_ms: 0,
     };
-    Job::new(view, Arc::new(request))
+    Job::new(view, Arc::new(request), 100)
 }
 
 /// A table with one running job of four frames, of which `done` are kept with ten bytes each.
 fn table(done: &[u64]) -> Arc<Jobs> {
-    let jobs = Jobs::starting_after(0);
+    let jobs = Jobs::new(0, 1 << 20);
     let mut table = jobs.lock();
     table.insert(job(JOB, 4));
     for &number in done {
@@ -106,13 +106,13 @@ fn kept(table: &Table) -> Vec<u64> {
 fn untaken_frames_are_never_dropped_while_their_job_runs() {
     let jobs = table(&[0, 1, 2]);
     let mut table = jobs.lock();
-    assert!(table.take(JOB, 0).is_some());
+    assert!(table.look_at(JOB, 0).is_some());
     assert_eq!((table.untaken_bytes(), table.bytes), (20, 30));
-    table.evict(5, (JOB, 2));
+    table.evict(5, Some((JOB, 2)));
     assert_eq!(kept(&table), [1, 2], "only the taken frame goes");
     table.set_state(JOB, JobState::Failed("for this test".into()));
     assert_eq!(table.untaken_bytes(), 0);
-    table.evict(10, (JOB, 2));
+    table.evict(10, Some((JOB, 2)));
     assert_eq!(kept(&table), [2], "of a job that is over others go too");
 }
 
@@ -121,10 +121,10 @@ fn frame_larger_than_the_budget_waits_for_its_watcher() {
     let jobs = table(&[0, 1, 2, 3]);
     let mut table = jobs.lock();
     assert_eq!(table.jobs[&JOB].view.state, JobState::Done);
-    table.evict(5, (JOB, 3));
+    table.evict(5, Some((JOB, 3)));
     assert_eq!(kept(&table), [3], "the one that came just now stays");
     table.put(JOB, frame(0, 10));
-    table.evict(5, (JOB, 0));
+    table.evict(5, Some((JOB, 0)));
     assert_eq!(kept(&table), [0], "until the next one comes");
 }
 
@@ -149,25 +149,25 @@ fn counted_bytes_are_the_sums_over_all_frames() {
             x ^= x << 17;
             (x >> 11) % n
         };
-        let mut table = Table::default();
+        let mut table = Table { most_held_bytes: usize::MAX, ..Table::default() };
         for step in 0..400 {
             let id = JobId(1 + below(4));
             let number = below(6);
             match below(8) {
                 0 if table.get(id).is_none() => table.insert(job(id, 6)),
                 1..4 => drop(table.put(id, frame(number, below(30) as usize))),
-                4 | 5 => drop(table.take(id, number)),
-                6 => table.evict(below(200) as usize, (id, number)),
+                4 | 5 => drop(table.look_at(id, number)),
+                6 => table.evict(below(200) as usize, Some((id, number))),
                 _ if below(20) == 0 => table.set_state(id, JobState::Cancelled),
                 _ => {}
             }
             let (mut all, mut untaken) = (0, 0);
             for job in table.jobs.values() {
                 let mut of_job = (0, 0);
-                for (number, frame) in &job.frames {
-                    all += frame.bytes.len();
-                    if !job.taken.contains(number) {
-                        of_job = (of_job.0 + 1, of_job.1 + frame.bytes.len());
+                for kept in job.frames.values() {
+                    all += kept.frame.bytes.len();
+                    if !kept.taken {
+                        of_job = (of_job.0 + 1, of_job.1 + kept.frame.bytes.len());
                     }
                 }
                 assert_eq!(job.untaken, of_job, "seed {seed}, step {step}");
@@ -181,7 +181,7 @@ fn counted_bytes_are_the_sums_over_all_frames() {
 
 #[test]
 fn oldest_finished_jobs_are_forgotten_beyond_the_limit() {
-    let mut table = Table::default();
+    let mut table = Table { most_held_bytes: usize::MAX, ..Table::default() };
     for id in 1..=MAX_JOBS as u64 + 2 {
         table.insert(job(JobId(id), 1));
         // The first one never ends.
@@ -222,15 +222,15 @@ async fn dropped_frame_is_asked_for_again() {
     let jobs = table(&[0, 1, 2, 3]);
     {
         let mut table = jobs.lock();
-        table.take(JOB, 0);
-        table.evict(35, (JOB, 3));
+        table.look_at(JOB, 0);
+        table.evict(35, Some((JOB, 3)));
         assert_eq!(kept(&table), [1, 2, 3]);
     }
     let (mut watch, mut events) = watch(&jobs, 0);
     assert!(matches!(watch.next().await, Some(WatchItem::Notice(_))));
     let waiting = tokio::spawn(async move { watch.next().await });
     assert!(events.recv().await.is_some(), "the driver is woken");
-    assert!(jobs.lock().jobs[&JOB].wanted_again.contains(&0));
+    assert_eq!(jobs.lock().jobs[&JOB].missing().collect::<Vec<_>>(), [0]);
     jobs.lock().put(JOB, frame(0, 1));
     jobs.ring();
     let Some(WatchItem::Frame(f)) = waiting.await.unwrap() else { panic!("frame 0") };
@@ -268,6 +268,76 @@ async fn notices_of_tiles_are_rate_limited_and_the_last_one_comes() {
     jobs.ring_tile();
     let Some(WatchItem::Notice(view)) = watch.next().await else { panic!("a notice") };
     assert_eq!(view.tiles, (1, 64));
+}
+
+/// A reader that stalls keeps its frame for a while, and others get theirs.
+#[tokio::test(start_paused = true)]
+async fn frame_in_hand_stays_for_a_while_and_is_rendered_again_after() {
+    let jobs = table(&[0, 1]);
+    let (mut watch, mut events) = watch(&jobs, 0);
+    assert!(matches!(watch.next().await, Some(WatchItem::Frame(_))));
+    {
+        let mut table = jobs.lock();
+        assert_eq!(table.in_hand_bytes(), 10);
+        table.evict(0, None);
+        assert_eq!(kept(&table), [0, 1], "one is in hand, the other untaken");
+    }
+    tokio::time::advance(IN_HAND).await;
+    {
+        let mut table = jobs.lock();
+        assert_eq!(table.in_hand_bytes(), 0);
+        table.evict(0, None);
+        assert_eq!(kept(&table), [1]);
+    }
+    events.recv().await.expect("it told that it took a frame");
+    let reading = tokio::spawn(async move { watch.again(0).await.map(|f| f.number) });
+    assert!(events.recv().await.is_some(), "the driver is woken");
+    assert_eq!(jobs.lock().jobs[&JOB].missing().collect::<Vec<_>>(), [0]);
+    jobs.lock().put(JOB, frame(0, 10));
+    jobs.ring();
+    assert_eq!(reading.await.unwrap(), Some(0));
+    assert_eq!(jobs.lock().jobs[&JOB].missing().count(), 0, "it waits no more");
+}
+
+#[tokio::test]
+async fn frame_that_a_watcher_waits_for_is_missing_until_the_watcher_leaves() {
+    let jobs = table(&[]);
+    let (mut watch, mut events) = watch(&jobs, 3);
+    assert!(matches!(watch.next().await, Some(WatchItem::Notice(_))));
+    let waiting = tokio::spawn(async move { watch.next().await.is_some() });
+    events.recv().await.expect("the driver is woken");
+    assert_eq!(jobs.lock().jobs[&JOB].missing().collect::<Vec<_>>(), [3]);
+    waiting.abort();
+    assert!(waiting.await.is_err());
+    assert_eq!(jobs.lock().jobs[&JOB].missing().count(), 0);
+}
+
+#[test]
+fn requests_of_jobs_in_progress_and_of_remembered_ones_are_bounded_in_bytes() {
+    let mut table = Table { most_held_bytes: 1000, ..Table::default() };
+    for id in 1..=30 {
+        assert!(table.has_place(100).is_ok(), "job {id}");
+        table.insert(job(JobId(id), 1));
+        table.set_state(JobId(id), JobState::Cancelled);
+        assert!(table.jobs.len() <= 10 && table.held_bytes <= 1000);
+    }
+    for id in 31..=40 {
+        table.has_place(100).expect("ten fit");
+        table.insert(job(JobId(id), 1));
+    }
+    let Err(SubmitError::Full(why)) = table.has_place(100) else { panic!("it is full") };
+    assert!(why.contains("10 jobs in progress take 1 MiB"), "{why}");
+    assert_eq!((table.jobs.len(), table.held_bytes), (10, 1000));
+}
+
+#[test]
+fn requests_that_are_being_checked_take_places() {
+    let jobs = Arc::new(Jobs::new(0, 1000));
+    let first = jobs.reserve(900).expect("it is empty");
+    assert!(matches!(jobs.reserve(200), Err(SubmitError::Full(_))));
+    let _second = jobs.reserve(100).expect("it fits");
+    drop(first);
+    jobs.reserve(900).expect("the first place is free again");
 }
 
 #[tokio::test]

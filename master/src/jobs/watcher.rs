@@ -5,7 +5,7 @@ use crate::driver::Event;
 use slabcast_common::ids::JobId;
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::mpsc;
+use tokio::sync::mpsc::{self, error::TrySendError};
 use tokio::sync::watch::{self, error::RecvError};
 use tokio::time::Instant;
 
@@ -72,6 +72,17 @@ pub struct Watch {
     quiet_until: Option<Instant>,
     driver: mpsc::Sender<Event>,
     is_over: bool,
+    /// The frame that it waits for, as the table knows.
+    waits_for: Option<u64>,
+    /// The frame that it took last, as the table knows.
+    in_hand: Option<u64>,
+}
+
+impl Drop for Watch {
+    fn drop(&mut self) {
+        self.let_go();
+        self.wait_no_more();
+    }
 }
 
 impl Watch {
@@ -83,14 +94,84 @@ impl Watch {
         driver: mpsc::Sender<Event>,
     ) -> Watch {
         let (bell, tile_bell) = jobs.listen();
-        let (last_notice, quiet_until, is_over) = (None, None, false);
-        Watch { jobs, job, next, bell, tile_bell, last_notice, quiet_until, driver, is_over }
+        Watch {
+            jobs,
+            job,
+            next,
+            bell,
+            tile_bell,
+            last_notice: None,
+            quiet_until: None,
+            driver,
+            is_over: false,
+            waits_for: None,
+            in_hand: None,
+        }
+    }
+
+    /// Tells the table that the frame that was taken last is no longer needed.
+    fn let_go(&mut self) {
+        if let Some(number) = self.in_hand.take() {
+            self.jobs.lock().put_back(self.job, number);
+        }
+    }
+
+    /// Has the driver look at the table. If its queue is full it will do so without being told.
+    /// Returns false if it has ended.
+    fn wake_driver(&self) -> bool {
+        !matches!(self.driver.try_send(Event::FrameTaken), Err(TrySendError::Closed(_)))
+    }
+
+    /// Tells the table that no frame is waited for.
+    fn wait_no_more(&mut self) {
+        if let Some(number) = self.waits_for.take() {
+            self.jobs.lock().waits_no_more(self.job, number);
+        }
+    }
+
+    /// Waits for a frame that was taken before and is needed again, in part. It is rendered again
+    /// if it was dropped meanwhile. Returns `None` if that can't be.
+    pub(crate) async fn again(&mut self, number: u64) -> Option<Arc<FinishedFrame>> {
+        self.let_go();
+        let found = loop {
+            let must_wake = {
+                self.bell.borrow_and_update();
+                let mut table = self.jobs.lock();
+                if let Some(frame) = table.look_at(self.job, number) {
+                    break Some(frame);
+                }
+                match table.get(self.job) {
+                    Some(job) if !job.retired && job.view.state.may_render() => {}
+                    _ => break None,
+                }
+                let is_new = self.waits_for.is_none();
+                is_new && {
+                    self.waits_for = Some(number);
+                    table.wait_for(self.job, number)
+                }
+            };
+            if must_wake && !self.wake_driver() {
+                break None;
+            }
+            if self.bell.changed().await.is_err() {
+                break None;
+            }
+        };
+        self.wait_no_more();
+        found
     }
 
     /// Waits for the next notice or frame. Returns `None` after the last frame, or after the
     /// notice which says that there will be no more. Frames come in order; each is marked as
     /// taken, which lets the master drop it when it needs room.
     pub async fn next(&mut self) -> Option<WatchItem> {
+        self.let_go();
+        let item = self.find_next().await;
+        self.wait_no_more();
+        item
+    }
+
+    async fn find_next(&mut self) -> Option<WatchItem> {
         loop {
             if self.is_over {
                 return None;
@@ -104,10 +185,11 @@ impl Watch {
                 }
                 let mut table = self.jobs.lock();
                 if let Some(frame) = table.take(self.job, self.next) {
-                    self.next += 1;
                     drop(table);
-                    // The driver may render ahead again. If it is busy it will see for itself.
-                    let _ = self.driver.try_send(Event::FrameTaken);
+                    self.in_hand = Some(self.next);
+                    self.next += 1;
+                    // It may render ahead again.
+                    self.wake_driver();
                     return Some(WatchItem::Frame(frame));
                 }
                 if let Some(reason) = table.failure(self.job, self.next) {
@@ -135,9 +217,13 @@ impl Watch {
                     self.quiet_until = Some(Instant::now() + TILE_NEWS);
                     return Some(WatchItem::Notice(view.clone()));
                 }
-                table.want_again(self.job, self.next)
+                // A notice ends the call and the wait, so that the next call begins to wait anew.
+                self.waits_for.is_none() && {
+                    self.waits_for = Some(self.next);
+                    table.wait_for(self.job, self.next)
+                }
             };
-            if wake_driver && self.driver.send(Event::FrameTaken).await.is_err() {
+            if wake_driver && !self.wake_driver() {
                 self.is_over = true;
                 return None;
             }

@@ -8,17 +8,20 @@ use slabcast_proto::MAX_RENDER_MESSAGE;
 use slabcast_proto::convert::{self, Page};
 use slabcast_proto::model::{self, JobNotice};
 use slabcast_proto::render_v1::render_service_server::RenderService;
+use slabcast_proto::render_v1::watch_frames_response::Message;
 use slabcast_proto::render_v1::{self as wire, WatchFramesResponse};
 use slabcast_proto::status::{Reason, invalid_field};
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::sync::mpsc::error::SendError;
 use tokio::sync::{Semaphore, mpsc};
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 use tracing::info;
 
-/// Watchers at a time; each holds up to four chunks of 1 MiB.
+/// Watchers at a time; each holds up to three chunks of 256 KiB: one that is written, one that
+/// waits, and what HTTP/2 has of one.
 const MAX_WATCHERS: usize = 256;
 
 /// Bytes of a list after which its page ends: half of what a response may have.
@@ -156,10 +159,7 @@ impl RenderService for Render {
                 let message = "client_key: belongs to another request; choose a fresh key";
                 Err(Reason::ClientKeyTaken.status(message, &[]))
             }
-            Err(SubmitError::Full) => {
-                let message = "the master has as many jobs as it takes; wait, or cancel one";
-                Err(Reason::TooManyJobs.retry(message, FULL_RETRY))
-            }
+            Err(SubmitError::Full(why)) => Err(Reason::TooManyJobs.retry(&why, FULL_RETRY)),
             Err(SubmitError::Gone) => {
                 Err(Reason::MasterEnding.retry("the master ends", ENDING_RETRY))
             }
@@ -186,7 +186,7 @@ impl RenderService for Render {
             Reason::TooManyWatchers.retry(message, FULL_RETRY)
         })?;
         let watch = self.handle.watch(job, from_frame).ok_or_else(|| job_not_found(&job_id))?;
-        let (out, outbound) = mpsc::channel(4);
+        let (out, outbound) = mpsc::channel(1);
         let handle = self.handle.clone();
         tokio::spawn(async move {
             let _place = place;
@@ -276,10 +276,11 @@ async fn send_frames(
     mut view: JobView,
     from_frame: u64,
     out: &mpsc::Sender<Result<WatchFramesResponse, Status>>,
-) -> Result<(), mpsc::error::SendError<Result<WatchFramesResponse, Status>>> {
+) -> Result<(), SendError<()>> {
+    let gone = |_| SendError(());
     let mut next = from_frame;
     // A stream begins with a notice, so that the caller knows that it is heard.
-    out.send(Ok(convert::notice_to_wire(&notice(&view)))).await?;
+    out.send(Ok(convert::notice_to_wire(&notice(&view)))).await.map_err(gone)?;
     loop {
         let item = tokio::select! {
             item = watch.next() => item,
@@ -288,20 +289,43 @@ async fn send_frames(
         match item {
             None => break,
             Some(WatchItem::Notice(news)) => {
-                out.send(Ok(convert::notice_to_wire(&notice(&news)))).await?;
+                out.send(Ok(convert::notice_to_wire(&notice(&news)))).await.map_err(gone)?;
                 view = news;
             }
             Some(WatchItem::Failed { number, reason }) => {
                 next = number + 1;
-                out.send(Ok(convert::frame_failed_to_wire(number, &reason))).await?;
+                out.send(Ok(convert::frame_failed_to_wire(number, &reason))).await.map_err(gone)?;
             }
             Some(WatchItem::Frame(f)) => {
                 next = f.number + 1;
                 let trace = f.trace_json.as_deref().unwrap_or("");
-                let chunks =
+                let mut chunks =
                     convert::frame_to_wire(f.number, f.size, f.format, &f.bytes, &f.stats, trace);
-                for chunk in chunks {
-                    out.send(Ok(chunk)).await?;
+                // A slice of the pixels would keep all of them for as long as the watcher takes to
+                // read. So each chunk is copied when there is room for it, from the frame as the
+                // table has it then, or rendered again.
+                let (number, frame) = (f.number, Arc::downgrade(&f));
+                drop(f);
+                let lengths: Vec<usize> = chunks.iter_mut().map(|c| take_pixels(c).len()).collect();
+                for (mut chunk, length) in chunks.into_iter().zip(lengths) {
+                    let room = out.reserve().await.map_err(|_| SendError(()))?;
+                    if length > 0 {
+                        let found = match frame.upgrade() {
+                            Some(frame) => Some(frame),
+                            None => watch.again(number).await,
+                        };
+                        let Some(frame) = found else {
+                            let message = format!(
+                                "frame {number} was dropped while it was read and can't be \
+                                 rendered again; submit the path anew"
+                            );
+                            let metadata = [("frame", number.to_string())];
+                            room.send(Err(Reason::FrameNotKept.status(&message, &metadata)));
+                            return Ok(());
+                        };
+                        put_pixels(&mut chunk, &frame.bytes, length);
+                    }
+                    room.send(Ok(chunk));
                 }
             }
         }
@@ -311,7 +335,23 @@ async fn send_frames(
         let mut metadata = vec![("frame", next.to_string())];
         let kept = handle.first_kept_frame(view.id, next);
         metadata.extend(kept.map(|kept| ("first_kept_frame", kept.to_string())));
-        out.send(Err(Reason::FrameNotKept.status(&message, &metadata))).await?;
+        out.send(Err(Reason::FrameNotKept.status(&message, &metadata))).await.map_err(gone)?;
     }
     Ok(())
+}
+
+/// Takes the pixels out of a chunk.
+fn take_pixels(response: &mut WatchFramesResponse) -> bytes::Bytes {
+    match &mut response.message {
+        Some(Message::Chunk(chunk)) => std::mem::take(&mut chunk.data),
+        _ => bytes::Bytes::new(),
+    }
+}
+
+/// Copies the `length` bytes of a chunk from the pixels of its frame.
+fn put_pixels(response: &mut WatchFramesResponse, pixels: &[u8], length: usize) {
+    if let Some(Message::Chunk(chunk)) = &mut response.message {
+        let begin = chunk.offset as usize;
+        chunk.data = bytes::Bytes::copy_from_slice(&pixels[begin..begin + length]);
+    }
 }

@@ -230,6 +230,11 @@ pub(super) struct Flight {
 }
 
 impl Flight {
+    /// Bytes of the nodes.
+    pub(super) fn held_bytes(&self) -> usize {
+        self.nodes.len() * (3 * size_of::<DVec3>() + size_of::<f64>())
+    }
+
     /// The camera of frame `i` of `frames`.
     pub(super) fn frame(&self, i: usize, frames: usize) -> Camera {
         let last = if self.closed { frames } else { frames.max(2) - 1 };

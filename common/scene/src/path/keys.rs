@@ -361,6 +361,11 @@ pub(super) struct KeyedPath {
 }
 
 impl KeyedPath {
+    /// Bytes of the keys.
+    pub(super) fn held_bytes(&self) -> usize {
+        self.keys.len() * size_of::<Stop>()
+    }
+
     /// The camera at a time in frames.
     pub(super) fn at(&self, time: f64) -> Camera {
         let after = self.keys.partition_point(|k| k.time <= time);

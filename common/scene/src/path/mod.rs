@@ -414,7 +414,7 @@ impl ViewPath {
         } else {
             Curve::None
         };
-        Ok(Cameras { path: self, lattice: *lattice, orientation, curve })
+        Ok(Cameras { path: self, prepared: Prepared { lattice: *lattice, orientation, curve } })
     }
 }
 
@@ -427,9 +427,7 @@ enum Curve {
 /// The cameras of a path, in any order.
 pub struct Cameras<'a> {
     path: &'a ViewPath,
-    lattice: Lattice,
-    orientation: Orientation,
-    curve: Curve,
+    prepared: Prepared,
 }
 
 impl Cameras<'_> {
@@ -438,12 +436,45 @@ impl Cameras<'_> {
     /// # Errors
     /// Names the field that is not finite or has no meaning.
     pub fn camera(&self, i: usize) -> Result<Camera, InvalidField> {
-        let i = self.path.first_frame() + i;
-        match (&self.curve, &self.path.turntable) {
+        self.prepared.camera(self.path, i)
+    }
+
+    /// Returns what was prepared, without the path: for whoever keeps both.
+    pub fn into_prepared(self) -> Prepared {
+        self.prepared
+    }
+}
+
+/// What the cameras of a path need beside the path itself. It grows with the keys or points of a
+/// path, and not with its frames.
+pub struct Prepared {
+    lattice: Lattice,
+    orientation: Orientation,
+    curve: Curve,
+}
+
+impl Prepared {
+    /// Returns the camera of wanted frame `i` (counted from 0) of `path`, for which this was
+    /// prepared ([`ViewPath::prepare`]).
+    ///
+    /// # Errors
+    /// Names the field that is not finite or has no meaning.
+    pub fn camera(&self, path: &ViewPath, i: usize) -> Result<Camera, InvalidField> {
+        let i = path.first_frame() + i;
+        match (&self.curve, &path.turntable) {
             (Curve::Keys(keys), _) => Ok(keys.at(i as f64)),
             (Curve::Flight(flight, frames), _) => Ok(flight.frame(i, *frames)),
             (Curve::None, Some(t)) => t.camera(i, &self.lattice, self.orientation),
-            (Curve::None, None) => self.path.views[i].camera(i, &self.lattice),
+            (Curve::None, None) => path.views[i].camera(i, &self.lattice),
+        }
+    }
+
+    /// Returns the bytes that it takes beside its own size.
+    pub fn held_bytes(&self) -> usize {
+        match &self.curve {
+            Curve::None => 0,
+            Curve::Keys(keys) => keys.held_bytes(),
+            Curve::Flight(flight, _) => flight.held_bytes(),
         }
     }
 }

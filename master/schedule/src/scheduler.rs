@@ -224,7 +224,12 @@ impl Scheduler {
                 }
             }
         }
-        if !is_quiet || is_due {
+        let woken = self.cluster.roster.take_woken();
+        for &worker in &woken {
+            self.active.iter_mut().for_each(|frame| frame.take_leases_for_good(worker));
+        }
+        if !is_quiet || is_due || !woken.is_empty() {
+            let freed_worker = freed_worker.filter(|_| woken.is_empty());
             self.advance(freed_worker, clock);
         }
     }
@@ -309,7 +314,11 @@ impl Scheduler {
         for (worker, nonce) in self.cluster.roster.beat(now, &self.cluster.config) {
             self.cluster.send(worker, ToWorker::Ping { nonce });
         }
-        if self.cluster.roster.end_pauses(now) {
+        let hushed = self.cluster.roster.hush(now, &self.cluster.config);
+        for &worker in &hushed {
+            self.active.iter_mut().for_each(|frame| frame.share_leases(worker));
+        }
+        if self.cluster.roster.end_pauses(now) || !hushed.is_empty() {
             freed_worker = None;
         }
         for frame in &mut self.active {

@@ -82,6 +82,9 @@ struct Head {
     protocol_version: u32,
     heartbeat: u64,
     silence: u64,
+    /// Off before version 5.
+    #[serde(default)]
+    hush: u64,
     lease: u64,
     poison_after: u32,
     queue_ahead: u32,

@@ -273,12 +273,14 @@ fn config(head: &Head) -> Result<Config, String> {
             head.pixels_version, head.program
         ));
     }
-    let &Head { heartbeat, silence, lease, poison_after, queue_ahead, .. } = head;
+    let &Head { heartbeat, silence, hush, lease, poison_after, queue_ahead, .. } = head;
     let sane = 1..=1 << 50;
-    if ![heartbeat, silence, lease].iter().all(|t| sane.contains(t)) || queue_ahead > 1 << 20 {
+    if ![heartbeat, silence, hush.max(1), lease].iter().all(|t| sane.contains(t))
+        || queue_ahead > 1 << 20
+    {
         return Err("has settings that no master has".into());
     }
-    Ok(Config { heartbeat, silence, lease, poison_after, queue_ahead, mixed: false })
+    Ok(Config { heartbeat, silence, hush, lease, poison_after, queue_ahead, mixed: false })
 }
 
 fn key(text: &str) -> Result<BrickSetKey, String> {

@@ -130,7 +130,7 @@ fn write(mut out: impl Write, entries: &Receiver<Entry>) -> std::io::Result<Reco
 
 /// Returns the first line of a record.
 fn head(config: &Config) -> Head {
-    let &Config { heartbeat, silence, lease, poison_after, queue_ahead, mixed: _ } = config;
+    let &Config { heartbeat, silence, hush, lease, poison_after, queue_ahead, mixed: _ } = config;
     Head {
         version: VERSION,
         program: env!("CARGO_PKG_VERSION").into(),
@@ -138,6 +138,7 @@ fn head(config: &Config) -> Head {
         protocol_version: PROTOCOL_VERSION,
         heartbeat,
         silence,
+        hush,
         lease,
         poison_after,
         queue_ahead,

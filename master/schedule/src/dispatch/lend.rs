@@ -72,7 +72,7 @@ impl FrameCore {
         is_copy: bool,
         now: Micros,
     ) {
-        cluster.roster.add_lease(id);
+        cluster.roster.add_lease(id, now, &cluster.config);
         if !bricks.is_empty() {
             cluster.residency.pin(id, &bricks);
             cluster.residency.want(id, bricks.iter().copied());

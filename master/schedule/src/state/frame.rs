@@ -567,6 +567,20 @@ impl Frame {
         core.table.queue.share_queued(&not_begun);
     }
 
+    /// Lends the tasks of a worker that says nothing to others too. Its leases stay live.
+    pub(crate) fn share_leases(&mut self, id: WorkerId) {
+        let core = self.core_mut();
+        let places: Vec<u32> = core.table.places(id).collect();
+        core.table.queue.share_unless_troubled(&places);
+    }
+
+    /// Keeps the tasks of a worker that is heard again for it, where no other has begun them.
+    pub(crate) fn take_leases_for_good(&mut self, id: WorkerId) {
+        let core = self.core_mut();
+        let places: Vec<u32> = core.table.places(id).collect();
+        core.table.queue.unshare(id, &places);
+    }
+
     /// Takes back the leases of a lost worker. `blame`: a task may have killed it. `threads`: as
     /// many leases were probably running. The caller has not removed its bricks from the books yet.
     pub(crate) fn lost(

@@ -490,6 +490,29 @@ impl TaskQueue {
         }
     }
 
+    /// Requeues tasks of a worker that says nothing, for others; its leases stay live. Not those
+    /// that workers failed at: they would take two at once.
+    pub(crate) fn share_unless_troubled(&mut self, places: &[u32]) {
+        for &place in places.iter().rev() {
+            if self.tasks[place as usize].may_speculate() {
+                self.requeue(place);
+            }
+        }
+    }
+
+    /// Takes tasks out of the queue again whose worker is heard again and that nobody else was lent.
+    pub(crate) fn unshare(&mut self, worker: WorkerId, places: &[u32]) {
+        for &place in places {
+            let task = &mut self.tasks[place as usize];
+            // One that is overdue still goes to another.
+            let has_time = |l: &Lease| l.worker == worker && l.deadline.is_some();
+            if task.leases.len() == 1 && task.leases.iter().all(has_time) {
+                let order = task.queued.take();
+                order.map(|order| self.waiting.remove(&order));
+            }
+        }
+    }
+
     /// Requeues tasks whose lease is past its deadline, for another worker.
     pub(crate) fn requeue_overdue(&mut self, now: Micros) {
         while let Some(&(deadline, place, epoch)) = self.deadlines.first()

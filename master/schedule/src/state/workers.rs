@@ -5,6 +5,8 @@
 //! | Deadline | Set when | After | Then |
 //! |---|---|---|---|
 //! | next ping | joined, pinged | 0, `heartbeat` | ping again |
+//! | ping while it has leases | anything heard, pinged | `hush` / 4 | ping again |
+//! | hush | it has leases; anything heard | `hush` | its tasks are lent to others too |
 //! | silence | anything heard | `silence` | the worker is lost |
 //! | lease (`task_queue`) | task leased | `lease` * 2^attempt | another worker gets it too |
 //! | speculation (`speculate`) | task leased | twice its estimate | an idle worker gets a copy |
@@ -76,6 +78,12 @@ pub(crate) struct Worker {
     directories: VecDeque<BrickSetKey>,
     heard: Micros,
     next_ping: Micros,
+    /// When it was pinged last, and since when it has leases.
+    pinged: Micros,
+    busy_since: Micros,
+    /// It has leases and was not heard for `hush`: it takes no more for now, and others have its
+    /// tasks too.
+    is_hushed: bool,
     /// Pings without a pong, oldest first: nonce and time.
     pings: VecDeque<(u64, Micros)>,
     offset: Option<Offset>,
@@ -105,7 +113,29 @@ impl Worker {
 
     /// Whether the worker is active: it takes leases.
     pub(crate) fn is_active(&self) -> bool {
-        !self.leaving && !self.is_spare && self.paused_until.is_none()
+        !self.leaving && !self.is_spare && !self.is_hushed && self.paused_until.is_none()
+    }
+
+    /// Since when it owes a sign of life, while it has leases.
+    fn quiet_since(&self) -> Micros {
+        self.heard.max(self.busy_since)
+    }
+
+    /// When it is pinged next.
+    fn ping_due(&self, config: &Config) -> Micros {
+        if self.leases == 0 || config.hush == 0 {
+            return self.next_ping;
+        }
+        let soon = self.quiet_since().max(self.pinged).saturating_add(config.hush / 4);
+        self.next_ping.min(soon)
+    }
+
+    /// When others are lent its tasks.
+    fn hush_due(&self, config: &Config) -> Micros {
+        match self.leases == 0 || config.hush == 0 || self.is_hushed {
+            true => Micros::MAX,
+            false => self.quiet_since().saturating_add(config.hush),
+        }
     }
 
     /// Whether a render thread has no lease.
@@ -138,6 +168,8 @@ pub(crate) struct Roster {
     changes: u64,
     /// Most workers that are active.
     limit: usize,
+    /// Workers that were heard again after others had their tasks.
+    woken: Vec<WorkerId>,
     /// Longest round trip to an active worker in microseconds, by each one's best ping, and whether
     /// most active threads are on the master's host. Each event asks, and both change seldom.
     round_trip_us: Micros,
@@ -155,6 +187,7 @@ impl Default for Roster {
             idle: 0,
             changes: 0,
             limit: usize::MAX,
+            woken: Vec::new(),
             round_trip_us: 0,
             is_mostly_local: false,
         }
@@ -191,6 +224,9 @@ impl Roster {
             directories: VecDeque::new(),
             heard: now,
             next_ping: now,
+            pinged: now,
+            busy_since: now,
+            is_hushed: false,
             pings: VecDeque::new(),
             offset: None,
         };
@@ -291,11 +327,15 @@ impl Roster {
         over > 0
     }
 
-    /// Counts a lease.
-    pub(crate) fn add_lease(&mut self, id: WorkerId) {
+    /// Counts a lease that is given now.
+    pub(crate) fn add_lease(&mut self, id: WorkerId, now: Micros, config: &Config) {
         let Some(w) = self.workers.get_mut(id) else { return };
         let before = w.has_idle_thread();
+        if w.leases == 0 {
+            w.busy_since = now;
+        }
         w.leases += 1;
+        self.quiet_until = self.quiet_until.min(w.ping_due(config));
         self.idle -= usize::from(before && !w.has_idle_thread());
     }
 
@@ -373,9 +413,36 @@ impl Roster {
 
     /// Notes that something was heard from a worker.
     pub(crate) fn heard(&mut self, id: WorkerId, now: Micros) {
-        if let Some(w) = self.workers.get_mut(id) {
-            w.heard = w.heard.max(now);
+        let Some(w) = self.workers.get_mut(id) else { return };
+        w.heard = w.heard.max(now);
+        if std::mem::take(&mut w.is_hushed) {
+            self.woken.push(id);
+            self.changes += 1;
+            self.survey();
         }
+    }
+
+    /// Takes the workers that were heard again since the last call, after others had their tasks.
+    pub(crate) fn take_woken(&mut self) -> Vec<WorkerId> {
+        std::mem::take(&mut self.woken)
+    }
+
+    /// Returns the workers with leases that were silent for so long that others get their tasks
+    /// too, each once.
+    pub(crate) fn hush(&mut self, now: Micros, config: &Config) -> Vec<WorkerId> {
+        if now < self.quiet_until {
+            return Vec::new();
+        }
+        let mut hushed = Vec::new();
+        for (id, w) in self.workers.iter_mut().filter(|(_, w)| w.hush_due(config) <= now) {
+            w.is_hushed = true;
+            hushed.push(id);
+        }
+        if !hushed.is_empty() {
+            self.changes += 1;
+            self.survey();
+        }
+        hushed
     }
 
     /// Notes the time; see the head of this file.
@@ -417,18 +484,19 @@ impl Roster {
         if now < self.quiet_until {
             return Vec::new();
         }
-        let due = |w: &Worker| w.next_ping <= now;
+        let due = |w: &Worker| w.ping_due(config) <= now;
         let ids: Vec<_> = self.iter().filter(|(_, w)| due(w)).map(|(id, _)| id).collect();
         let beaten = ids
             .into_iter()
             .map(|id| {
-                self.workers.get_mut(id).expect("just seen").next_ping = now + config.heartbeat;
+                let w = self.workers.get_mut(id).expect("just seen");
+                (w.next_ping, w.pinged) = (now + config.heartbeat, now);
                 (id, self.ping(id, now))
             })
             .collect();
         let due = |w: &Worker| {
-            let due = w.next_ping.min(w.heard.saturating_add(config.silence));
-            due.min(w.paused_until.unwrap_or(Micros::MAX))
+            let due = w.ping_due(config).min(w.heard.saturating_add(config.silence));
+            due.min(w.hush_due(config)).min(w.paused_until.unwrap_or(Micros::MAX))
         };
         self.quiet_until = self.workers.values().map(due).min().unwrap_or(0);
         beaten

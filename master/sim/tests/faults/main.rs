@@ -4,6 +4,7 @@
 //! Campaigns draw whole clusters and their incidents from seeds; [`stories`] change one thing each.
 
 mod pattern;
+mod silent;
 mod statistics;
 mod stories;
 mod unfinished;

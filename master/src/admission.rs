@@ -11,7 +11,12 @@ use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
 use slabcast_proto::model::Worker;
 use slabcast_schedule::{WorkerIdentity, WorkerView};
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 use std::time::Instant;
+
+/// Bytes of bricks that a worker may hold: one brick at least, and what a process can address at most
+/// (2^47).
+const MEMORY: RangeInclusive<u64> = 4096..=1 << 47;
 
 /// Reason why a worker is not let in. The text names the worker's property, the master's, and the
 /// remedy, for the worker's operator.
@@ -35,20 +40,29 @@ pub enum AttachError {
         /// The worker's pixels version.
         worker: u32,
     },
-    /// The worker's self-test tile has another hash.
+    /// The worker's self-test tile has another hash. Which one it should have is not told: a
+    /// stranger would say it the next time.
     #[error(
-        "the worker's self-test tile hashes to {worker}, it must be {SELF_TEST_SHA256}; its \
-         machine or build rounds differently, use an official build"
+        "the worker's self-test tile differs from the one that it must draw; its machine or build \
+         rounds differently, use an official build (`slabcast doctor` on its machine shows both \
+         hashes)"
     )]
-    SelfTest {
-        /// The worker's hash in hexadecimal, at most 64 characters of it.
-        worker: String,
-    },
+    SelfTest,
     /// The worker has no render threads, or more than [`MAX_THREADS`].
     #[error("{worker} render threads; give 1 to {MAX_THREADS}")]
     Threads {
         /// The worker's render threads.
         worker: u32,
+    },
+    /// The worker may hold less than a brick, or more than a process can.
+    #[error(
+        "{worker} bytes of memory for bricks; give {} to {} (slabcast worker --memory)",
+        MEMORY.start(),
+        MEMORY.end()
+    )]
+    Memory {
+        /// The worker's budget in bytes.
+        worker: u64,
     },
     /// The worker rehearses a trace, and the master does not.
     #[error(
@@ -77,11 +91,13 @@ fn check(hello: &Hello, rehearses: bool) -> Result<u32, AttachError> {
         return Err(AttachError::Pixels { worker: hello.pixels_version });
     }
     if hello.self_test_sha256 != SELF_TEST_SHA256 {
-        let worker = hello.self_test_sha256.chars().take(64).collect();
-        return Err(AttachError::SelfTest { worker });
+        return Err(AttachError::SelfTest);
     }
     if !(1..=MAX_THREADS).contains(&hello.threads) {
         return Err(AttachError::Threads { worker: hello.threads });
+    }
+    if !MEMORY.contains(&hello.memory_budget_bytes) {
+        return Err(AttachError::Memory { worker: hello.memory_budget_bytes });
     }
     match (hello.rehearses, rehearses) {
         (true, false) => Err(AttachError::Rehearses),
@@ -285,8 +301,18 @@ mod tests {
             ),
             (
                 Hello { self_test_sha256: wrong.clone(), ..hello() },
-                AttachError::SelfTest { worker: wrong[..64].into() },
-                [wrong[..64].into(), SELF_TEST_SHA256.into()],
+                AttachError::SelfTest,
+                ["self-test tile differs".into(), "official build".into()],
+            ),
+            (
+                Hello { memory_budget_bytes: 0, ..hello() },
+                AttachError::Memory { worker: 0 },
+                ["0 bytes of memory".into(), "4096 to 140737488355328".into()],
+            ),
+            (
+                Hello { memory_budget_bytes: u64::MAX, ..hello() },
+                AttachError::Memory { worker: u64::MAX },
+                ["18446744073709551615 bytes".into(), "--memory".into()],
             ),
             (
                 Hello { threads: 0, ..hello() },
@@ -303,6 +329,7 @@ mod tests {
             assert_eq!(refused, want);
             let text = refused.to_string();
             assert!(says.iter().all(|s| text.contains(s)), "{text}");
+            assert!(!text.contains(SELF_TEST_SHA256), "{text}");
         }
     }
 

@@ -1,4 +1,5 @@
-//! Links on which bits flip, and links that swallow bricks: pixels stay true, and nothing hangs.
+//! Links on which bits flip, links that swallow bricks, and a worker that says too much: pixels stay
+//! true, nothing hangs, and nobody else waits.
 //!
 //! A proxy stands between a master and its worker, and between the master and a client. The
 //! campaign of a hundred thousand flips in each direction runs at night (`tests/nightly.sh flips`).
@@ -10,17 +11,25 @@ use proxy::{Noise, Place, Proxy, Swallows};
 use sha2::{Digest, Sha256};
 use slabcast_client::{Client, PATIENCE, Update};
 use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::message::{Hello, ToMaster, ToWorker};
+use slabcast_common::protocol::PROTOCOL_VERSIONS;
 use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_master::jobs::WatchItem;
 use slabcast_master::{Handle, Master, MasterConfig};
+use slabcast_proto::cluster_v1::BricksResponse;
+use slabcast_proto::cluster_v1::cluster_service_client::ClusterServiceClient;
+use slabcast_proto::{convert, sealed};
 use slabcast_render::Simd;
 use slabcast_scene::path::{Orientation, Turntable, ViewPath};
 use slabcast_scene::request::PathRequest;
 use slabcast_scene::transfer::TransferChoice;
 use slabcast_worker::{BrickCache, Config, Link};
-use std::sync::atomic::Ordering::Relaxed;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 use tokio::sync::watch;
+use tokio_stream::StreamExt;
+use tokio_stream::wrappers::ReceiverStream;
 
 /// Longest time that a job may take on a noisy link. Without flips it takes a tenth of a second; a
 /// lease lasts a minute.
@@ -36,7 +45,11 @@ struct World {
 
 impl World {
     async fn new() -> World {
-        let volume = slabcast_volumes::open("formula:spheres:40".as_ref()).expect("a formula");
+        World::of("formula:spheres:40").await
+    }
+
+    async fn of(formula: &str) -> World {
+        let volume = slabcast_volumes::open(formula.as_ref()).expect("a formula");
         let orientation = Orientation::new(None, None).expect("the defaults");
         let master = Master::start(MasterConfig::new(volume, orientation)).expect("a master");
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
@@ -277,4 +290,119 @@ async fn flipped_bits_of_frames_to_a_client_are_found_and_the_frame_comes_again(
 async fn many_flips_of_frames_to_a_client_are_found() {
     let flips = std::env::var("SLABCAST_FLIPS").map_or(100_000, |n| n.parse().expect("a number"));
     watched(5, flips, 3).await;
+}
+
+/// A worker that draws nothing and asks for all bricks of the set again and again, by lawful
+/// messages, without reading one. Returns the bricks that it named until `stop`.
+async fn flood(address: String, mut stop: watch::Receiver<bool>) -> u64 {
+    let hello = Hello {
+        protocol_versions: PROTOCOL_VERSIONS,
+        pixels_version: slabcast_common::PIXELS_VERSION,
+        name: "flood".into(),
+        threads: 1,
+        memory_budget_bytes: 1 << 40,
+        simd: "plain".into(),
+        self_test_sha256: slabcast_common::SELF_TEST_SHA256.into(),
+        held: vec![],
+        rehearses: false,
+        machine: "elsewhere".into(),
+    };
+    let connect = || ClusterServiceClient::connect(format!("http://{address}"));
+    let (say, said) = tokio::sync::mpsc::channel::<ToMaster>(8);
+    let messages = ReceiverStream::new(said).map(|m| convert::from_worker_to_wire(&m));
+    let (sealed_out, opener) = sealed::ends(messages);
+    let hello = tokio_stream::once(convert::from_worker_to_wire(&ToMaster::Hello(hello)));
+    let mut control = connect().await.unwrap();
+    let mut inbound = control.control(hello.chain(sealed_out)).await.unwrap().into_inner();
+    let mut unread = None;
+    let (mut flooding, named) = (None, Arc::new(AtomicU64::new(0)));
+    loop {
+        let message = tokio::select! {
+            message = inbound.message() => message,
+            _ = stop.changed() => break,
+        };
+        let Ok(Some(message)) = message else { break };
+        let Some(message) = opener.open(message).unwrap() else { continue };
+        match convert::to_worker_from_wire(message).unwrap() {
+            (_, Some(session)) => {
+                let open = tokio_stream::once(convert::bricks_open_to_wire(session));
+                let (open, _) =
+                    sealed::ends::<_, BricksResponse>(open.chain(tokio_stream::pending()));
+                unread = Some(connect().await.unwrap().bricks(open).await.unwrap());
+            }
+            (ToWorker::Ping { nonce }, _) => {
+                let _ = say.try_send(ToMaster::Pong { nonce, clock_us: nonce });
+            }
+            (ToWorker::Directory { set, bricks, .. }, _) if flooding.is_none() => {
+                let bricks: Vec<_> = bricks.iter().map(|b| b.id).collect();
+                let (say, named) = (say.clone(), named.clone());
+                flooding = Some(tokio::spawn(async move {
+                    loop {
+                        let bricks = bricks.clone();
+                        named.fetch_add(2 * bricks.len() as u64, Relaxed);
+                        let wanted = ToMaster::BricksWanted { set, bricks: bricks.clone() };
+                        let evicted = ToMaster::BricksEvicted { set, bricks };
+                        if say.send(wanted).await.is_err() || say.send(evicted).await.is_err() {
+                            return;
+                        }
+                    }
+                }));
+            }
+            _ => {}
+        }
+    }
+    drop(unread);
+    if let Some(flooding) = flooding {
+        flooding.abort();
+    }
+    named.load(Relaxed)
+}
+
+/// Half of what `ListWorkers` took, in some calls one after the other.
+async fn median_answer(handle: &Handle) -> Duration {
+    let mut took = Vec::new();
+    for _ in 0..41 {
+        let before = Instant::now();
+        handle.workers().await;
+        took.push(before.elapsed());
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    took.sort_unstable();
+    took[took.len() / 2]
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn worker_that_asks_for_all_bricks_again_and_again_makes_nobody_else_wait() {
+    let (mut world, begin) = (World::of("formula:spheres:200").await, Instant::now());
+    let handle = world.master.handle();
+    world.dial("honest", &world.address);
+    let (stop, stopped) = watch::channel(false);
+    let flooding = tokio::spawn(flood(world.address.clone(), stopped));
+    while handle.workers().await.len() < 2 {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    let idle = median_answer(&handle).await;
+    // By regions, of which each worker gets the directory.
+    world.jobs = 1;
+    let (request, before) = (world.request(), Instant::now());
+    tokio::time::timeout(PATIENT, world.run(request)).await.expect("no frame hangs");
+    let first = before.elapsed();
+    let beside = median_answer(&handle).await;
+    world.jobs = 7;
+    let (request, before) = (world.request(), Instant::now());
+    tokio::time::timeout(PATIENT, world.run(request)).await.expect("no frame hangs");
+    let second = before.elapsed();
+    stop.send_replace(true);
+    let named = flooding.await.unwrap();
+    println!(
+        "ListWorkers takes {idle:.1?} idle and {beside:.1?} beside a flood that named {named} \
+         bricks; jobs of 3 frames took {first:.1?} and {second:.1?}"
+    );
+    // The account of a new link, what fills it, and what may be on its way unread: a byte a brick.
+    let trickle = (1 << 17) as f64 * (begin.elapsed().as_secs_f64() + 1.0);
+    let most = (1 << 18) + trickle as u64 + sealed::WINDOW_BYTES as u64 + (1 << 17);
+    assert!(named > 1 << 18, "it says more than it may: {named}");
+    assert!(named < most, "it is read slowly then: {named} of {most}");
+    assert!(beside < idle + Duration::from_millis(150), "{beside:?}, {idle:?} when idle");
+    world.stop.send_replace(true);
 }

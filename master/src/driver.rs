@@ -35,7 +35,7 @@ use slabcast_volumes::BrickStore;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
 use tracing::{info, warn};
 
 /// Everything that can happen to the master.
@@ -48,8 +48,8 @@ pub(crate) enum Event {
         link: WorkerLink,
         reply: oneshot::Sender<Result<WorkerId, AttachError>>,
     },
-    /// A worker said something.
-    Said { worker: WorkerId, message: ToMaster },
+    /// A worker said something, in one of the places that it has in the queue.
+    Said { worker: WorkerId, message: ToMaster, _place: OwnedSemaphorePermit },
     /// A worker's link ended. `is_damage`: the line was at fault.
     Detached { worker: WorkerId, reason: String, is_damage: bool },
     /// A client's request was checked.
@@ -222,7 +222,7 @@ impl Driver {
             Event::Attach { hello, caller, link, reply } => {
                 let _ = reply.send(self.attach(hello, caller, link));
             }
-            Event::Said { worker, message } => self.said(worker, message),
+            Event::Said { worker, message, _place } => self.said(worker, message),
             Event::Detached { worker, reason, is_damage } => {
                 if let Some(is_leaving) = self.workers.remove(worker) {
                     if is_leaving {

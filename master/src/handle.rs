@@ -18,7 +18,7 @@ use slabcast_scene::path::Orientation;
 use slabcast_scene::request::PathRequest;
 use std::sync::Arc;
 use std::time::SystemTime;
-use tokio::sync::{Semaphore, mpsc, oneshot};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
 /// Requests that are checked at a time: with two, one whose bricks are looked through for its
 /// framing does not hold up a short one.
@@ -264,9 +264,15 @@ impl Handle {
         &self.hooks
     }
 
-    /// Passes a worker's message to the driver. Returns false when the master is gone.
-    pub async fn worker_said(&self, worker: WorkerId, message: ToMaster) -> bool {
-        self.inbox.send(Event::Said { worker, message }).await.is_ok()
+    /// Passes a worker's message to the driver, which gives its place back once it has handled it.
+    /// Returns false when the master is gone.
+    pub(crate) async fn worker_said(
+        &self,
+        worker: WorkerId,
+        message: ToMaster,
+        place: OwnedSemaphorePermit,
+    ) -> bool {
+        self.inbox.send(Event::Said { worker, message, _place: place }).await.is_ok()
     }
 
     /// Tells the driver that a worker's link has ended, and why. `is_damage`: the line was at fault,

@@ -45,6 +45,7 @@
 //! ```
 
 pub mod admission;
+mod allowance;
 mod brick_sets;
 mod driver;
 pub mod finish;

@@ -13,7 +13,7 @@ use slabcast_proto::convert::Bricks;
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use tokio::sync::mpsc;
+use tokio::sync::{Semaphore, mpsc};
 use tracing::warn;
 
 /// An order for one worker's bricks. Orders are carried out in the order in which they are sent.
@@ -86,6 +86,23 @@ impl Damaged {
     pub fn get(&self) -> u64 {
         self.0.messages.load(Ordering::Relaxed)
     }
+}
+
+/// Places of one worker in the driver's inbox: a turn of the driver handles no more of it, and whoever
+/// else has something to say waits for no more. At a quarter of it, the driver would have to wake a
+/// link within a turn to have the results of 64 threads in one turn.
+const PLACES: usize = 64;
+
+/// Places that a message takes: one, and one more for each 128 bricks that it names (12 us of the
+/// driver).
+fn places_of(message: &ToMaster) -> u32 {
+    let named = match message {
+        ToMaster::BricksWanted { bricks, .. }
+        | ToMaster::BricksEvicted { bricks, .. }
+        | ToMaster::BricksBroken { bricks, .. } => bricks.len(),
+        _ => 0,
+    };
+    (1 + named / 128).min(PLACES) as u32
 }
 
 /// Why a link ended before its worker closed it.
@@ -212,9 +229,14 @@ pub(crate) async fn serve_until(
     };
     // The driver holds the other sender: when it drops that, the link is over.
     drop(control);
+    let places = Arc::new(Semaphore::new(PLACES));
     let carry = async {
         while let Some(message) = replies.recv().await {
-            if !handle.worker_said(worker, message).await {
+            // The driver gives the place back when it has handled the message.
+            let Ok(place) = places.clone().acquire_many_owned(places_of(&message)).await else {
+                return None;
+            };
+            if !handle.worker_said(worker, message, place).await {
                 return None;
             }
         }

@@ -29,9 +29,6 @@ const CONNECT: Duration = Duration::from_secs(5);
 /// First wait before dialling again; it doubles up to [`LONGEST_WAIT`] (cluster.proto).
 const FIRST_WAIT: Duration = Duration::from_millis(100);
 
-/// Time after which a damaged message is asked for again (`cluster.proto`, Seals).
-const ASK_AGAIN: Duration = Duration::from_millis(100);
-
 /// Longest wait before dialling again. A link that lived longer was a good one: the wait after it
 /// is the first again.
 const LONGEST_WAIT: Duration = Duration::from_secs(5);
@@ -268,7 +265,7 @@ async fn carry(
         };
         let message = tokio::select! {
             message = inbound.message() => message,
-            () = tokio::time::sleep(ASK_AGAIN), if opener.is_waiting() => {
+            () = tokio::time::sleep(opener.patience()), if opener.is_waiting() => {
                 match opener.ask_again() {
                     Ok(()) => continue,
                     Err(e) => break Err(e.into()),
@@ -344,7 +341,7 @@ async fn carry_bricks(
     loop {
         let message = tokio::select! {
             message = inbound.message() => message,
-            () = tokio::time::sleep(ASK_AGAIN), if opener.is_waiting() => {
+            () = tokio::time::sleep(opener.patience()), if opener.is_waiting() => {
                 match opener.ask_again() {
                     Ok(()) => continue,
                     Err(e) => return lost(e.to_string()),

@@ -2,22 +2,25 @@
 
 use super::{GOODBYE, Responses};
 use crate::Handle;
+use crate::allowance::{self, Account};
 use crate::link::{BrickOrder, Broken, Caller, Damaged, WorkerLink, serve_until};
 use slabcast_common::link::BRICK_BATCHES_IN_FLIGHT;
 use slabcast_common::message::{ToMaster, ToWorker};
 use slabcast_proto::cluster_v1::cluster_service_server::ClusterService;
-use slabcast_proto::cluster_v1::{BricksRequest, BricksResponse, ControlRequest, ControlResponse};
+use slabcast_proto::cluster_v1::{
+    BricksRequest, BricksResponse, ControlRequest, ControlResponse, bricks_response,
+};
 use slabcast_proto::convert::{self, BrickBatches, Down};
 use slabcast_proto::sealed::{self, Incoming, Seals, StreamError};
-use slabcast_proto::status::Reason;
+use slabcast_proto::status::{Reason, invalid_field};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Request, Response, Status, Streaming};
-use tracing::debug;
+use tracing::{debug, warn};
 
 /// Time that a worker may take from connecting to its hello, and from its welcome to its second
 /// connection.
@@ -27,21 +30,19 @@ const HELLO: Duration = Duration::from_secs(10);
 /// encoded, in the driver's own channel ([`WorkerLink::control`]).
 const CONTROL_MESSAGES: usize = 64;
 
-/// Time after which a damaged message is asked for again (`cluster.proto`, Seals).
-const ASK_AGAIN: Duration = Duration::from_millis(100);
-
 /// Brick orders of links whose second connection is not there yet, by session.
 type Sessions = Arc<Mutex<BTreeMap<u64, Waiting>>>;
 
 struct Waiting {
     orders: mpsc::UnboundedReceiver<BrickOrder>,
+    account: Arc<Mutex<Account>>,
     damaged: Damaged,
     /// Dropped when the Bricks stream ends; the Control stream watches its other end.
     alive: oneshot::Sender<()>,
 }
 
-fn locked(sessions: &Sessions) -> MutexGuard<'_, BTreeMap<u64, Waiting>> {
-    sessions.lock().unwrap_or_else(PoisonError::into_inner)
+fn locked<T>(shared: &Mutex<T>) -> MutexGuard<'_, T> {
+    shared.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The service.
@@ -111,7 +112,7 @@ impl ClusterService for Cluster {
             let (messages, source) = mpsc::channel(BRICK_BATCHES_IN_FLIGHT);
             let (sealed, opener) = sealed::ends(ReceiverStream::new(source));
             let carried = async {
-                let Waiting { orders, alive, damaged } =
+                let Waiting { orders, account, alive, damaged } =
                     open_bricks(&mut inbound, &opener, &sessions).await?;
                 // Nothing more comes up but acknowledgements; the end of that stream is the
                 // worker's.
@@ -128,7 +129,7 @@ impl ClusterService for Cluster {
                     }
                 };
                 let ended = tokio::select! {
-                    () = send_bricks(orders, &messages) => Ok(()),
+                    () = send_bricks(orders, &account, &messages) => Ok(()),
                     ended = up => ended,
                 };
                 drop(alive);
@@ -174,7 +175,7 @@ async fn next_message<M: Seals>(
     loop {
         let message = tokio::select! {
             message = inbound.message() => message?,
-            () = tokio::time::sleep(ASK_AGAIN), if opener.is_waiting() => {
+            () = tokio::time::sleep(opener.patience()), if opener.is_waiting() => {
                 opener.ask_again().map_err(unsealed)?;
                 continue;
             }
@@ -213,6 +214,7 @@ async fn open_bricks(
 /// and one message hold, however long the order is.
 async fn send_bricks(
     mut orders: mpsc::UnboundedReceiver<BrickOrder>,
+    account: &Mutex<Account>,
     out: &mpsc::Sender<BricksResponse>,
 ) {
     while let Some(order) = orders.recv().await {
@@ -220,9 +222,12 @@ async fn send_bricks(
             BrickOrder::Send { set, store, bricks } => {
                 let encoded = bricks.iter().filter_map(|id| store.encoded(*id));
                 for message in BrickBatches::new(&set, encoded) {
-                    if out.send(message).await.is_err() {
-                        return;
+                    // A place first, so that nothing counts as sent to a worker that reads nothing.
+                    let Ok(place) = out.reserve().await else { return };
+                    if let Some(bricks_response::Message::Batch(batch)) = &message.message {
+                        locked(account).sent_bricks(batch.bricks.len() as u64);
                     }
+                    place.send(message);
                 }
             }
             BrickOrder::Drop { set, bricks } => {
@@ -256,12 +261,14 @@ async fn control(
         return Err(out_of_order("Hello must come first"));
     };
 
+    let name = hello.name.clone();
     let (control_tx, mut control_rx) = mpsc::unbounded_channel::<ToWorker>();
     let (orders_tx, orders) = mpsc::unbounded_channel();
     let (alive, mut bricks_ended) = oneshot::channel();
     let session = new_session()?;
     let damaged = Damaged::of(hello.name.clone(), caller.address.clone());
-    let waiting = Waiting { orders, alive, damaged: damaged.clone() };
+    let account = Arc::new(Mutex::new(Account::new()));
+    let waiting = Waiting { orders, account: account.clone(), alive, damaged: damaged.clone() };
     locked(&sessions).insert(session, waiting);
     let link = WorkerLink { control: control_tx, bricks: orders_tx, damaged: damaged.clone() };
     let (replies, mut reply_rx) = mpsc::channel(64);
@@ -282,6 +289,7 @@ async fn control(
     let (sealed, opener) = sealed::ends(ReceiverStream::new(source));
     let down = async {
         while let Some(message) = control_rx.recv().await {
+            locked(&account).sent(&message);
             let parts = match convert::to_worker_to_wire(&message, session) {
                 Down::Control(refused) if matches!(message, ToWorker::Refused { .. }) => {
                     // A worker of any version must be able to read it.
@@ -303,14 +311,35 @@ async fn control(
         drop(messages);
         std::future::pending::<()>().await;
     };
+    let begun = Instant::now();
     let up = async {
+        let mut told = false;
         loop {
             let before = opener.damaged();
             let next = next_message(&mut inbound, &opener).await;
             damaged.add(opener.damaged() - before);
             let Some(message) = next? else { return Ok::<(), Status>(()) };
-            if replies.send(convert::from_worker_from_wire(message)?).await.is_err() {
-                return Ok(());
+            let message = convert::from_worker_from_wire(message)?;
+            if !locked(&account).confirms(&message) {
+                let problem = "says that more bricks came than were sent";
+                return Err(invalid_field("bricks_received.bricks", problem));
+            }
+            for piece in allowance::pieces(message) {
+                let wait = locked(&account).take(&piece, begun.elapsed());
+                if !wait.is_zero() {
+                    if !std::mem::replace(&mut told, true) {
+                        let address = &caller.address;
+                        warn!(
+                            worker = name,
+                            address,
+                            "peer limited: it says more than was asked of it, and is read slowly"
+                        );
+                    }
+                    tokio::time::sleep(wait).await;
+                }
+                if replies.send(piece).await.is_err() {
+                    return Ok(());
+                }
             }
         }
     };

@@ -217,6 +217,23 @@ async fn watcher_gets_frames_in_order_and_then_the_final_state() {
     assert!(watch.next().await.is_none());
 }
 
+/// Frames of a job are drawn side by side: the last one may be done first.
+#[tokio::test]
+async fn watcher_that_came_late_ends_with_its_job_and_not_with_its_last_frame() {
+    let jobs = table(&[2, 3]);
+    let (mut watch, _events) = watch(&jobs, 3);
+    assert!(matches!(watch.next().await, Some(WatchItem::Frame(frame)) if frame.number == 3));
+    let running = watch.next().await;
+    assert!(matches!(running, Some(WatchItem::Notice(view)) if view.state == JobState::Running));
+    for number in [0, 1] {
+        jobs.lock().put(JOB, frame(number, 10));
+    }
+    jobs.ring();
+    let last = watch.next().await;
+    assert!(matches!(last, Some(WatchItem::Notice(view)) if view.state == JobState::Done));
+    assert!(watch.next().await.is_none());
+}
+
 #[tokio::test]
 async fn dropped_frame_is_asked_for_again() {
     let jobs = table(&[0, 1, 2, 3]);

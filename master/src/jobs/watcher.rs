@@ -201,7 +201,8 @@ impl Watch {
                     return None;
                 };
                 let view = &job.view;
-                if self.next >= view.frames_total
+                // One that came late may have all of its frames before those ahead of them are done.
+                if (self.next >= view.frames_total && view.state.is_over())
                     || matches!(view.state, JobState::Failed(_) | JobState::Cancelled)
                     || job.retired
                 {

@@ -33,6 +33,7 @@ use slabcast_proto::model::Worker;
 use slabcast_schedule::{Clock, Event as Happened, Micros};
 use slabcast_volumes::BrickStore;
 use std::collections::BTreeMap;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
@@ -53,7 +54,11 @@ pub(crate) enum Event {
     /// A worker's link ended. `is_damage`: the line was at fault.
     Detached { worker: WorkerId, reason: String, is_damage: bool },
     /// A client's request was checked.
-    Submit { plan: Box<Plan>, reply: oneshot::Sender<Result<JobId, SubmitError>> },
+    Submit {
+        plan: Box<Plan>,
+        peer: Option<IpAddr>,
+        reply: oneshot::Sender<Result<JobId, SubmitError>>,
+    },
     /// A brick set was cut.
     BricksCut { set: BrickSetKey, store: Result<Arc<BrickStore>, Panicked> },
     /// A watcher took a frame, so that there may be room for another, or waits for one.
@@ -238,8 +243,8 @@ impl Driver {
                     self.refresh_states();
                 }
             }
-            Event::Submit { plan, reply } => {
-                let _ = reply.send(self.submit(*plan));
+            Event::Submit { plan, peer, reply } => {
+                let _ = reply.send(self.submit(*plan, peer));
             }
             Event::BricksCut { set, store } => self.bricks_cut(set, store),
             Event::FrameTaken => {}

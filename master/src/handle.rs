@@ -10,12 +10,14 @@ use crate::link::{Caller, WorkerLink};
 use crate::memory::Shares;
 use crate::panics::caught;
 use crate::record::{RecordedScheduler, Recorder};
+use crate::serve::{PeerLimits, counted_as};
 use slabcast_common::ids::{JobId, WorkerId};
 use slabcast_common::message::{Hello, ToMaster};
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_proto::model::Worker;
 use slabcast_scene::path::Orientation;
 use slabcast_scene::request::PathRequest;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::SystemTime;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
@@ -35,6 +37,10 @@ pub struct MasterConfig {
     pub orientation: Orientation,
     /// Bytes that the master may hold, by what takes them.
     pub shares: Shares,
+    /// What one address may have at a time.
+    pub peer_limits: PeerLimits,
+    /// Whether clients of other machines are told the name of the volume's file.
+    pub show_names: bool,
     /// Settings of the scheduler that the master drives.
     pub schedule: slabcast_schedule::Config,
     /// Recorder of the scheduler's events and decisions ([`crate::record::start`]).
@@ -54,6 +60,8 @@ impl MasterConfig {
             volume: volume.into(),
             orientation,
             shares: Shares::default(),
+            peer_limits: PeerLimits::default(),
+            show_names: false,
             schedule: slabcast_schedule::Config::default(),
             record: None,
             rehearse: false,
@@ -101,8 +109,11 @@ impl Master {
         });
         let (inbox, events) = mpsc::channel(INBOX);
         // Ids are never used again, not even by the next master at this address: a client that
-        // takes up its watch must not see another's job.
-        let jobs = Arc::new(Jobs::new(unix_ms() as u64, config.shares.requests));
+        // takes up its watch must not see another's job. The clock may be set back, so chance
+        // decides: 31 bits, above room for four million jobs. Numbers stay below 2^53, which every
+        // language's JSON has exactly.
+        let run = getrandom::u32().map_err(std::io::Error::other)? >> 1;
+        let jobs = Arc::new(Jobs::new(u64::from(run) << 22, config.shares.requests));
         let finishers = Finishers::start(&inbox, &config.hooks)?;
         let handle = Handle {
             inbox: inbox.clone(),
@@ -111,6 +122,8 @@ impl Master {
             volume: config.volume.clone(),
             planning: Arc::new(Semaphore::new(PLANS_AT_ONCE)),
             shares: config.shares,
+            peer_limits: config.peer_limits,
+            show_names: config.show_names,
             hooks: config.hooks.clone(),
         };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build()?;
@@ -158,6 +171,8 @@ pub struct Handle {
     volume: Arc<Volume>,
     planning: Arc<Semaphore>,
     shares: Shares,
+    peer_limits: PeerLimits,
+    show_names: bool,
     hooks: Hooks,
 }
 
@@ -165,6 +180,23 @@ impl Handle {
     /// Returns the description of the volume that is served.
     pub fn volume(&self) -> &ServedVolume {
         &self.served
+    }
+
+    /// Returns the volume's name as a caller at `peer` may know it: its file's name may be a
+    /// patient's, so others than this machine's callers get the first digits of its digest.
+    pub(crate) fn name_for(&self, peer: Option<IpAddr>) -> String {
+        let is_own = peer.is_none_or(|ip| ip.to_canonical().is_loopback());
+        if is_own || self.show_names {
+            return self.served.name.clone();
+        }
+        let mut digest = self.served.info.digest.to_string();
+        digest.truncate(12);
+        format!("sha256:{digest}")
+    }
+
+    /// Returns what one address may have at a time.
+    pub(crate) fn peer_limits(&self) -> PeerLimits {
+        self.peer_limits
     }
 
     /// Submits a view path and returns its job. A request that was submitted before under its
@@ -176,6 +208,19 @@ impl Handle {
     /// [`SubmitError::Refused`] names a field that can't be used; the others say why the master
     /// takes no such job now.
     pub async fn submit(&self, request: PathRequest) -> Result<JobId, SubmitError> {
+        self.submit_from(request, None).await
+    }
+
+    /// Submits a view path, as [`Handle::submit`], for a client that calls from `peer`.
+    ///
+    /// # Errors
+    /// As [`Handle::submit`].
+    pub async fn submit_from(
+        &self,
+        request: PathRequest,
+        peer: Option<IpAddr>,
+    ) -> Result<JobId, SubmitError> {
+        let peer = peer.map(counted_as);
         check_key(&request.client_key)?;
         if let Some(job) = self.jobs.lock().by_key(&request.client_key) {
             if *job.request != request {
@@ -186,7 +231,7 @@ impl Handle {
             }
         }
         // Whom the driver would turn away costs no check.
-        let _checking = self.jobs.reserve(request.held_bytes())?;
+        let _checking = self.jobs.reserve(request.held_bytes(), peer, self.peer_limits.jobs)?;
         let place = self.planning.clone().acquire_owned().await.map_err(|_| SubmitError::Gone)?;
         let (served, hooks) = (self.served.clone(), self.hooks.clone());
         let (volume, shares) = (self.volume.clone(), self.shares);
@@ -200,7 +245,7 @@ impl Handle {
         let plan = planned.await.map_err(|_| SubmitError::Gone)?;
         let plan = Box::new(plan.map_err(|e| SubmitError::Panicked(e.to_string()))??);
         let (reply, answer) = oneshot::channel();
-        if self.inbox.send(Event::Submit { plan, reply }).await.is_err() {
+        if self.inbox.send(Event::Submit { plan, peer, reply }).await.is_err() {
             return Err(SubmitError::Gone);
         }
         answer.await.map_err(|_| SubmitError::Gone)?

@@ -62,3 +62,4 @@ pub mod serve;
 pub use admission::AttachError;
 pub use handle::{Handle, Master, MasterConfig, ServedVolume};
 pub use jobs::submit::SubmitError;
+pub use serve::PeerLimits;

@@ -5,8 +5,8 @@
 //! so that a unit file needs none.
 
 use crate::systemd::{self, DRAIN};
-use slabcast_master::MasterConfig;
 use slabcast_master::memory::{Shares, available};
+use slabcast_master::{MasterConfig, PeerLimits};
 use slabcast_scene::path::Axis;
 use slabcast_session::embedded::start_master;
 use slabcast_session::fail::{Fail, reason, say};
@@ -58,6 +58,21 @@ pub(crate) struct MasterArgs {
     /// Memory for frames, brick sets and requests, beside the volume [default: half of what is free]
     #[arg(long, value_name = "BYTES", value_parser = parse::memory)]
     memory: Option<u64>,
+    /// Jobs in progress that one address may have
+    #[arg(long, value_name = "N", default_value = "100", hide_short_help = true,
+          value_parser = clap::value_parser!(u32).range(1..=200))]
+    peer_jobs: u32,
+    /// Watchers that one address may have
+    #[arg(long, value_name = "N", default_value = "128", hide_short_help = true,
+          value_parser = clap::value_parser!(u32).range(1..=256))]
+    peer_watchers: u32,
+    /// Connections that one address may have; a worker takes two
+    #[arg(long, value_name = "N", default_value = "1024", hide_short_help = true,
+          value_parser = clap::value_parser!(u32).range(1..=4096))]
+    peer_connections: u32,
+    /// Tell clients on other machines the name of the volume's file, which may be a patient's
+    #[arg(long, value_parser = clap::builder::FalseyValueParser::new())]
+    show_names: bool,
     /// Events and decisions of the scheduler, for `slabcast lab replay`; some 25 KB a frame
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
@@ -83,6 +98,14 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
     let mut config = MasterConfig::new(volume, orientation);
     config.shares = shares(args.memory);
     tell_memory(volume_bytes, &config.shares);
+    config.peer_limits = PeerLimits {
+        jobs: args.peer_jobs as usize,
+        watchers: args.peer_watchers as usize,
+        connections: args.peer_connections as usize,
+        ..PeerLimits::default()
+    };
+    config.show_names = args.show_names;
+    raise_files();
     config.rehearse = args.rehearse;
     config.machine = boot_id();
     if args.rehearse {
@@ -171,6 +194,32 @@ fn tell_memory(volume_bytes: u64, shares: &Shares) {
         "memory at most"
     );
 }
+
+/// Files that a master may have open at best: 4096 connections, and some.
+#[cfg(unix)]
+const FILES: u64 = 8192;
+
+/// Raises the limit of open files: a shell's default of 1024 is 1000 connections.
+#[cfg(unix)]
+fn raise_files() {
+    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+    let most = maximum.unwrap_or(u64::MAX).min(FILES.max(current.unwrap_or(u64::MAX)));
+    let raised = setrlimit(Resource::Nofile, Rlimit { current: Some(most), maximum });
+    let files = if raised.is_ok() { Some(most) } else { current };
+    if files.is_some_and(|files| files < FILES) {
+        warn!(
+            files,
+            needed = FILES,
+            "the limit of open files is low: connections beyond it are turned away; raise it with \
+             `ulimit -Hn`, or LimitNOFILE in the unit"
+        );
+    }
+}
+
+/// Systems without such a limit have nothing to raise.
+#[cfg(not(unix))]
+fn raise_files() {}
 
 /// Takes the address without opening it. Refuses what others can reach, unless `insecure`.
 async fn bind(text: &str, insecure: bool) -> Result<TcpSocket, Fail> {

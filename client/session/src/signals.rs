@@ -1,4 +1,4 @@
-//! Ctrl-C and SIGTERM.
+//! Ctrl-C, SIGTERM and SIGHUP.
 
 use crate::fail::Fail;
 use crate::progress;
@@ -13,7 +13,12 @@ static TOLD: Notify = Notify::const_new();
 #[cfg(unix)]
 pub fn listen() {
     use tokio::signal::unix::{SignalKind, signal};
-    for (kind, code) in [(SignalKind::interrupt(), 130), (SignalKind::terminate(), 143)] {
+    let mut kinds = vec![(SignalKind::interrupt(), 130), (SignalKind::terminate(), 143)];
+    // `nohup` has it ignored, and that stays.
+    if !is_hangup_ignored() {
+        kinds.push((SignalKind::hangup(), 129));
+    }
+    for (kind, code) in kinds {
         // No handler can be had on systems without signals: they keep their own ways.
         let Ok(mut stream) = signal(kind) else { continue };
         tokio::spawn(async move {
@@ -25,6 +30,14 @@ pub fn listen() {
             }
         });
     }
+}
+
+/// Whether the process was started to outlive its terminal.
+#[cfg(unix)]
+fn is_hangup_ignored() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|m| m & 1 != 0)
 }
 
 /// Starts to listen for Ctrl-C, which then no longer ends the process at once; a second one does.

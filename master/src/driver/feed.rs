@@ -155,10 +155,11 @@ impl Driver {
             }
         };
         let Some(store) = self.brick_sets.get(job.scene.bricks).cloned() else { return false };
-        if number == job.next {
-            job.next += 1;
+        // All before a frame that is drawn ahead have ended or are in flight.
+        if number == job.next || (!wanted && number > job.next) {
+            job.next = number + 1;
         }
-        job.begun += 1;
+        let Some(job) = self.active.begun(id, making_bytes) else { return false };
         self.jobs.lock().begins(id, number);
         // Frames that were taken make place for this one.
         let making: u64 = self.flights.values().map(|f| f.making_bytes).sum();

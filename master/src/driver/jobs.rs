@@ -5,10 +5,15 @@ use crate::jobs::JobState;
 use crate::jobs::submit::{Plan, SubmitError};
 use slabcast_common::ids::{FrameId, JobId};
 use slabcast_schedule::Event as Happened;
+use std::net::IpAddr;
 use tracing::{info, warn};
 
 impl Driver {
-    pub(super) fn submit(&mut self, plan: Plan) -> Result<JobId, SubmitError> {
+    pub(super) fn submit(
+        &mut self,
+        plan: Plan,
+        peer: Option<IpAddr>,
+    ) -> Result<JobId, SubmitError> {
         let mut table = self.jobs.lock();
         // Another request may have come under this key while this one was checked.
         if let Some(job) = table.by_key(&plan.request.client_key) {
@@ -24,11 +29,15 @@ impl Driver {
         }
         table.has_place(plan.held_bytes())?;
         let id = table.next_id();
-        let entry = plan.entry(id);
-        info!(job = %id, frames = entry.view.frames_total, sums = ?plan.quality().sums, "job submitted");
+        let mut entry = plan.entry(id);
+        entry.peer = peer;
+        info!(
+            job = %id, peer = peer.map(|ip| ip.to_string()),
+            frames = entry.view.frames_total, sums = ?plan.quality().sums, "job submitted"
+        );
         table.insert(entry);
         drop(table);
-        self.activate(id, plan, 0);
+        self.activate(id, plan, peer, 0);
         Ok(id)
     }
 
@@ -39,21 +48,22 @@ impl Driver {
         if self.active.contains(id) {
             self.refresh_states();
         } else {
-            self.activate(id, plan, u64::MAX);
+            let peer = self.jobs.lock().get(id).and_then(|job| job.peer);
+            self.activate(id, plan, peer, u64::MAX);
         }
         self.jobs.ring();
     }
 
     /// Makes a job active: its frames from number `next` on are drawn, and those that are wanted
     /// again.
-    fn activate(&mut self, id: JobId, plan: Plan, next: u64) {
+    fn activate(&mut self, id: JobId, plan: Plan, peer: Option<IpAddr>, next: u64) {
         let bricks = match self.brick_sets.covering(&plan.wanted) {
             Some(store) => store.needs().clone(),
             None => plan.wanted.clone(),
         };
         let mut job = plan.activate(id, self.served.info.clone(), bricks);
         job.next = next.min(job.views.len());
-        self.active.insert(id, job);
+        self.active.insert(id, job, peer);
         self.refresh_states();
     }
 

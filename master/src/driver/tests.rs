@@ -426,9 +426,8 @@ async fn frames_that_nobody_takes_stop_no_watcher() {
     // From the middle: the frames before are nobody's, and do not come first.
     let mut watch = handle.watch(jobs[1], 50).expect("it is there");
     let item = loop {
-        match watch.next().await.expect("a frame") {
-            WatchItem::Frame(frame) => break frame.number,
-            _ => {}
+        if let WatchItem::Frame(frame) = watch.next().await.expect("a frame") {
+            break frame.number;
         }
     };
     assert_eq!(item, 50);
@@ -492,5 +491,40 @@ async fn one_frame_does_not_wait_for_a_hundred_thousand() {
     // Those in flight, and as many as end while each of three frames is drawn beside them.
     assert!(after - before <= 100, "{} frames came before three", after - before);
     watching.abort();
+    master.shutdown().await;
+}
+
+/// Four jobs of one address and one of another: each address has half of the work.
+#[tokio::test]
+async fn addresses_share_the_work_whatever_the_number_of_their_jobs() {
+    let master = master(Hooks::default(), 1000);
+    let handle = master.handle();
+    join(&handle, Arc::default());
+    let mut jobs = Vec::new();
+    for (key, host) in [("a", 1), ("b", 1), ("c", 1), ("d", 1), ("e", 2)] {
+        let peer = Some([10, 0, 0, host].into());
+        let job = handle.submit_from(request(key, 100_000, "grey"), peer).await.expect("good");
+        let watching = handle.clone();
+        tokio::spawn(async move { watched(&watching, job).await });
+        jobs.push(job);
+    }
+    let done = |job: &JobId| handle.job(*job).expect("it is there").frames_done;
+    while done(&jobs[4]) < 60 {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    let (one, other): (u64, u64) = (jobs[..4].iter().map(done).sum(), done(&jobs[4]));
+    assert!(one.abs_diff(other) < 30, "{one} frames of four jobs, {other} of one");
+    jobs.iter().for_each(|job| drop(handle.cancel(*job)));
+    master.shutdown().await;
+}
+
+#[tokio::test]
+async fn name_of_the_file_is_told_to_this_machine_alone() {
+    let master = master(Hooks::default(), 1_000_000);
+    let handle = master.handle();
+    let name = |ip: Option<&str>| handle.name_for(ip.map(|ip| ip.parse().expect("an address")));
+    assert_eq!([name(None), name(Some("127.0.0.1")), name(Some("::ffff:127.0.0.1"))], ["v"; 3]);
+    let other = name(Some("10.0.0.1"));
+    assert!(other.starts_with("sha256:") && other.len() == 19, "{other}");
     master.shutdown().await;
 }

@@ -9,6 +9,7 @@ use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_scene::request::PathRequest;
 use slabcast_scene::tween::Tween;
 use std::collections::{BTreeMap, VecDeque};
+use std::net::IpAddr;
 use std::sync::Arc;
 
 /// Finished jobs that can be watched again from the start without being submitted anew.
@@ -69,10 +70,18 @@ impl ActiveJob {
 pub(crate) struct ActiveJobs {
     by_id: BTreeMap<JobId, ActiveJob>,
     order: VecDeque<JobId>,
+    /// Addresses that jobs came from (`None`: this process), and the work of their frames that were
+    /// begun. An address that comes anew begins where the least of the others is, so that it is
+    /// served at once and has no claim on the past.
+    peers: BTreeMap<Option<IpAddr>, u64>,
+    peer_of: BTreeMap<JobId, Option<IpAddr>>,
 }
 
 impl ActiveJobs {
-    pub(crate) fn insert(&mut self, id: JobId, job: ActiveJob) {
+    pub(crate) fn insert(&mut self, id: JobId, job: ActiveJob, peer: Option<IpAddr>) {
+        let least = self.peers.values().copied().min().unwrap_or(0);
+        self.peers.entry(peer).or_insert(least);
+        self.peer_of.insert(id, peer);
         self.by_id.insert(id, job);
         self.order.push_back(id);
     }
@@ -87,11 +96,28 @@ impl ActiveJobs {
 
     pub(crate) fn remove(&mut self, id: JobId) -> Option<ActiveJob> {
         self.order.retain(|other| *other != id);
+        if let Some(peer) = self.peer_of.remove(&id)
+            && !self.peer_of.values().any(|other| *other == peer)
+        {
+            self.peers.remove(&peer);
+        }
         self.by_id.remove(&id)
     }
 
     pub(crate) fn contains(&self, id: JobId) -> bool {
         self.by_id.contains_key(&id)
+    }
+
+    /// Notes that a frame of a job was begun, which takes so many bytes while it is made.
+    /// Returns the job.
+    pub(crate) fn begun(&mut self, id: JobId, making_bytes: u64) -> Option<&ActiveJob> {
+        self.by_id.get_mut(&id)?.begun += 1;
+        let peer = self.peer_of.get(&id).and_then(|peer| self.peers.get_mut(peer));
+        if let Some(work) = peer {
+            // A small frame is work, too.
+            *work += making_bytes + (1 << 20);
+        }
+        self.by_id.get(&id)
     }
 
     /// Ids, oldest first.
@@ -105,9 +131,10 @@ impl ActiveJobs {
         self.by_id.iter().any(|(id, job)| job.scene.bricks == bricks && is_open(id))
     }
 
-    /// The frame that each job would begin next, in the order of their turns: one that a watcher
-    /// waits for, or else the next that was never rendered. Within a turn, frames that are waited
-    /// for come first, and older jobs. `is_in_flight` tells of frames that are being rendered.
+    /// The frame that each job would begin next: one that a watcher waits for, or else the next that
+    /// was never rendered. Jobs of the address of which least was drawn come first, and among its
+    /// jobs those in earlier turns. Within a turn, frames that are waited for come first, and older
+    /// jobs. `is_in_flight` tells of frames that are being rendered.
     pub(crate) fn candidates(
         &self,
         table: &Table,
@@ -125,9 +152,10 @@ impl ActiveJobs {
         };
         let jobs = self.order.iter().filter_map(|&id| {
             let active = self.by_id.get(&id)?;
-            Some((active.turn(), next(id, active)?))
+            let work = self.peer_of.get(&id).and_then(|peer| self.peers.get(peer)).copied();
+            Some(((work, active.turn()), next(id, active)?))
         });
-        let mut candidates: Vec<(u32, Candidate)> = jobs.collect();
+        let mut candidates: Vec<((Option<u64>, u32), Candidate)> = jobs.collect();
         candidates.sort_by_key(|(turn, candidate)| (*turn, !candidate.wanted));
         candidates.into_iter().map(|(_, candidate)| candidate).collect()
     }

@@ -6,7 +6,7 @@
 //! fill their half of the budget (back-pressure). The other half is for frames that a watcher waits
 //! for, so that frames which nobody takes stop nobody. Frames that were taken are kept while there
 //! is room, and rendered again when a watcher asks for one that was dropped: a frame is a pure
-//! function of its job. So a watcher that reads slowly holds its frame for [`IN_HAND`] and no
+//! function of its job. So a watcher that reads slowly holds its frame for `IN_HAND` and no
 //! longer.
 
 pub(crate) mod active;
@@ -28,6 +28,7 @@ use slabcast_common::stats::FrameStats;
 use slabcast_scene::path::Framing;
 use slabcast_scene::request::PathRequest;
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::IpAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use submit::SubmitError;
@@ -155,6 +156,8 @@ struct Kept {
 pub(crate) struct Job {
     pub(crate) view: JobView,
     pub(crate) request: Arc<PathRequest>,
+    /// The address that it was submitted from; `None`: this process.
+    pub(crate) peer: Option<IpAddr>,
     /// Frames that are kept, by number.
     frames: BTreeMap<u64, Kept>,
     /// Numbers of frames that were finished at least once.
@@ -179,6 +182,7 @@ impl Job {
         Job {
             view,
             request,
+            peer: None,
             frames: BTreeMap::new(),
             ever_done: Numbers::default(),
             untaken: (0, 0),
@@ -258,8 +262,8 @@ pub(crate) struct Table {
     /// Bytes of all jobs' requests, and how many there may be.
     held_bytes: usize,
     most_held_bytes: usize,
-    /// Bytes of each request that is being checked.
-    checking: Vec<usize>,
+    /// Bytes of each request that is being checked, and its address.
+    checking: Vec<(usize, Option<IpAddr>)>,
     /// Frames that watchers took and have not sent on: how many hold one, and until when it stays.
     in_hand: BTreeMap<(JobId, u64), (u32, Instant)>,
 }
@@ -565,13 +569,28 @@ impl Jobs {
     ///
     /// # Errors
     /// [`SubmitError::Full`] with the figures.
-    pub(crate) fn reserve(self: &Arc<Self>, bytes: usize) -> Result<Checking, SubmitError> {
+    pub(crate) fn reserve(
+        self: &Arc<Self>,
+        bytes: usize,
+        peer: Option<IpAddr>,
+        most_of_a_peer: usize,
+    ) -> Result<Checking, SubmitError> {
         let mut table = self.lock();
         let open = table.jobs.values().filter(|job| !job.view.state.is_over());
-        let others = open.map(|job| job.held_bytes).chain(table.checking.iter().copied());
-        table.has_place_among(others, bytes)?;
-        table.checking.push(bytes);
-        Ok(Checking { jobs: self.clone(), bytes })
+        let others: Vec<(usize, Option<IpAddr>)> = open
+            .map(|job| (job.held_bytes, job.peer))
+            .chain(table.checking.iter().copied())
+            .collect();
+        let of_peer = others.iter().filter(|other| other.1 == peer).count();
+        if peer.is_some() && of_peer >= most_of_a_peer {
+            return Err(SubmitError::Full(format!(
+                "{of_peer} jobs from your address are in progress, as many as one address may have \
+                 (--peer-jobs of the master); wait, cancel one, or put several views into one path"
+            )));
+        }
+        table.has_place_among(others.iter().map(|other| other.0), bytes)?;
+        table.checking.push((bytes, peer));
+        Ok(Checking { jobs: self.clone(), entry: (bytes, peer) })
     }
 
     /// Wakes the watchers.
@@ -594,13 +613,13 @@ impl Jobs {
 /// A place of a request that is being checked, from [`Jobs::reserve`].
 pub(crate) struct Checking {
     jobs: Arc<Jobs>,
-    bytes: usize,
+    entry: (usize, Option<IpAddr>),
 }
 
 impl Drop for Checking {
     fn drop(&mut self) {
         let mut table = self.jobs.lock();
-        if let Some(i) = table.checking.iter().position(|bytes| *bytes == self.bytes) {
+        if let Some(i) = table.checking.iter().position(|entry| *entry == self.entry) {
             table.checking.swap_remove(i);
         }
     }

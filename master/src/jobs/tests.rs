@@ -350,11 +350,11 @@ fn requests_of_jobs_in_progress_and_of_remembered_ones_are_bounded_in_bytes() {
 #[test]
 fn requests_that_are_being_checked_take_places() {
     let jobs = Arc::new(Jobs::new(0, 1000));
-    let first = jobs.reserve(900).expect("it is empty");
-    assert!(matches!(jobs.reserve(200), Err(SubmitError::Full(_))));
-    let _second = jobs.reserve(100).expect("it fits");
+    let first = jobs.reserve(900, None, 9).expect("it is empty");
+    assert!(matches!(jobs.reserve(200, None, 9), Err(SubmitError::Full(_))));
+    let _second = jobs.reserve(100, None, 9).expect("it fits");
     drop(first);
-    jobs.reserve(900).expect("the first place is free again");
+    jobs.reserve(900, None, 9).expect("the first place is free again");
 }
 
 #[tokio::test]

@@ -1,5 +1,6 @@
 //! ClusterService: the two streams of a worker's link.
 
+use super::connections::{Peer, State};
 use super::{GOODBYE, Responses};
 use crate::Handle;
 use crate::allowance::{self, Account};
@@ -82,6 +83,7 @@ impl ClusterService for Cluster {
         &self,
         request: Request<Streaming<ControlRequest>>,
     ) -> Result<Response<Self::ControlStream>, Status> {
+        let state = request.extensions().get::<Peer>().map(|peer| peer.state.clone());
         let [remote, local] = [request.remote_addr(), request.local_addr()];
         let caller = Caller {
             address: remote.map(|a| a.to_string()).unwrap_or_default(),
@@ -92,7 +94,7 @@ impl ClusterService for Cluster {
         let (out, outbound) = mpsc::channel(CONTROL_MESSAGES);
         let (handle, sessions) = (self.handle.clone(), self.sessions.clone());
         tokio::spawn(async move {
-            if let Err(status) = control(handle, sessions, &caller, inbound, &out).await {
+            if let Err(status) = control(handle, sessions, (&caller, state), inbound, &out).await {
                 debug!(address = caller.address, status = status.message(), "control ended");
                 end(&out, status).await;
             }
@@ -104,6 +106,7 @@ impl ClusterService for Cluster {
         &self,
         request: Request<Streaming<BricksRequest>>,
     ) -> Result<Response<Self::BricksStream>, Status> {
+        let state = request.extensions().get::<Peer>().map(|peer| peer.state.clone());
         let mut inbound = request.into_inner();
         // Those that wait are in the channel to the seals, and one is here.
         let (out, outbound) = mpsc::channel(1);
@@ -114,6 +117,7 @@ impl ClusterService for Cluster {
             let carried = async {
                 let Waiting { orders, account, alive, damaged } =
                     open_bricks(&mut inbound, &opener, &sessions).await?;
+                state.iter().for_each(|state| state.is_worker());
                 // Nothing more comes up but acknowledgements; the end of that stream is the
                 // worker's.
                 let up = async {
@@ -249,7 +253,7 @@ async fn send_bricks(
 async fn control(
     handle: Handle,
     sessions: Sessions,
-    caller: &Caller,
+    (caller, state): (&Caller, Option<Arc<State>>),
     mut inbound: Streaming<ControlRequest>,
     out: &mpsc::Sender<Result<ControlResponse, Status>>,
 ) -> Result<(), Status> {
@@ -260,6 +264,7 @@ async fn control(
     let ToMaster::Hello(hello) = convert::from_worker_from_wire(first)? else {
         return Err(out_of_order("Hello must come first"));
     };
+    state.iter().for_each(|state| state.is_worker());
 
     let name = hello.name.clone();
     let (control_tx, mut control_rx) = mpsc::unbounded_channel::<ToWorker>();

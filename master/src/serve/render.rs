@@ -1,6 +1,7 @@
 //! RenderService: jobs, frames, the volume and the workers.
 
 use super::Responses;
+use super::peers::Counts;
 use crate::jobs::{JobState, JobView, Watch, WatchItem};
 use crate::{Handle, SubmitError};
 use slabcast_common::ids::JobId;
@@ -37,11 +38,16 @@ const ENDING_RETRY: Duration = Duration::from_secs(1);
 pub(super) struct Render {
     handle: Handle,
     watchers: Arc<Semaphore>,
+    of_peers: Arc<Counts>,
 }
 
 impl Render {
     pub(super) fn new(handle: Handle) -> Self {
-        Render { handle, watchers: Arc::new(Semaphore::new(MAX_WATCHERS)) }
+        Render {
+            handle,
+            watchers: Arc::new(Semaphore::new(MAX_WATCHERS)),
+            of_peers: Arc::default(),
+        }
     }
 
     /// The job with an id, or NOT_FOUND.
@@ -142,9 +148,10 @@ impl RenderService for Render {
         &self,
         request: Request<wire::SubmitPathRequest>,
     ) -> Result<Response<wire::SubmitPathResponse>, Status> {
+        let peer = request.remote_addr().map(|address| address.ip());
         let request = convert::submit_from_wire(request.into_inner())?;
         let path = request.path.clone();
-        match self.handle.submit(request).await {
+        match self.handle.submit_from(request, peer).await {
             Ok(id) => {
                 let framing = self.handle.job(id).and_then(|job| job.framing);
                 Ok(Response::new(wire::SubmitPathResponse {
@@ -171,6 +178,7 @@ impl RenderService for Render {
         &self,
         request: Request<wire::WatchFramesRequest>,
     ) -> Result<Response<Self::WatchFramesStream>, Status> {
+        let peer = request.remote_addr().map(|address| address.ip());
         let wire::WatchFramesRequest { job_id, from_frame, checked } = request.into_inner();
         let (job, view) = self.job(&job_id)?;
         if from_frame > view.frames_total {
@@ -181,15 +189,25 @@ impl RenderService for Render {
             let total = ("frames_total", total.to_string());
             return Err(Reason::FrameBeyondEnd.status(&message, &[total]));
         }
+        let most = self.handle.peer_limits().watchers;
+        let share = peer.map(|ip| self.of_peers.take(ip, most));
+        if share.as_ref().is_some_and(Option::is_none) {
+            let message = format!(
+                "{most} watchers from your address are open, as many as one address may have \
+                 (--peer-watchers of the master); end one, or wait"
+            );
+            return Err(Reason::TooManyWatchers.retry(&message, FULL_RETRY));
+        }
         let place = self.watchers.clone().try_acquire_owned().map_err(|_| {
-            let message = "the master has as many watchers as it takes; wait";
-            Reason::TooManyWatchers.retry(message, FULL_RETRY)
+            let message =
+                format!("the master has {MAX_WATCHERS} watchers, as many as it takes; wait");
+            Reason::TooManyWatchers.retry(&message, FULL_RETRY)
         })?;
         let watch = self.handle.watch(job, from_frame).ok_or_else(|| job_not_found(&job_id))?;
         let (out, outbound) = mpsc::channel(1);
         let handle = self.handle.clone();
         tokio::spawn(async move {
-            let _place = place;
+            let _places = (place, share);
             // A send that fails: the watcher is gone.
             let _ = send_frames(&handle, watch, view, from_frame, &out).await;
         });
@@ -228,10 +246,11 @@ impl RenderService for Render {
         &self,
         request: Request<wire::CancelJobRequest>,
     ) -> Result<Response<wire::CancelJobResponse>, Status> {
+        let peer = request.remote_addr().map(|address| address.ip().to_string());
         let job_id = request.into_inner().job_id;
         let (job, _) = self.job(&job_id)?;
         if self.handle.cancel(job).await {
-            info!(%job, "job cancelled by a client");
+            info!(%job, peer, "job cancelled by a client");
         }
         let (_, view) = self.job(&job_id)?;
         Ok(Response::new(wire::CancelJobResponse { job: Some(job_to_wire(&view)) }))
@@ -239,11 +258,11 @@ impl RenderService for Render {
 
     async fn describe_volume(
         &self,
-        _: Request<wire::DescribeVolumeRequest>,
+        request: Request<wire::DescribeVolumeRequest>,
     ) -> Result<Response<wire::DescribeVolumeResponse>, Status> {
         let v = self.handle.volume();
         Ok(Response::new(convert::volume_to_wire(&model::VolumeDescription {
-            name: v.name.clone(),
+            name: self.handle.name_for(request.remote_addr().map(|address| address.ip())),
             file_type: v.file_type.clone(),
             anatomical: v.anatomical,
             info: v.info.clone(),

@@ -92,7 +92,8 @@ fn reason_from_wire(field: &str, text: String) -> Result<String, WireError> {
     if text.len() > MAX_REASON {
         return Err(WireError::too_long(field, text.len(), MAX_REASON));
     }
-    Ok(text)
+    // It is printed for people: nothing of it moves a cursor or begins a line.
+    Ok(if text.contains(char::is_control) { text.replace(char::is_control, " ") } else { text })
 }
 
 /// Checks a name: not empty, and nothing that could forge a log line.

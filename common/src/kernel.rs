@@ -43,7 +43,7 @@ impl Profile {
     pub fn new(kernel: Kernel, std: f64, radius: f64) -> Self {
         match kernel {
             Kernel::Gaussian => Profile::gaussian(std, radius),
-            Kernel::Bspline | Kernel::Tent => {
+            Kernel::Bspline | Kernel::Interpolating | Kernel::Tent => {
                 Profile { kernel, std, radius, spread: 1.0, edge: 0.0, norm: 1.0 }
             }
         }
@@ -75,7 +75,7 @@ impl Profile {
             Kernel::Gaussian => {
                 (libm::exp(-u * u / (2.0 * self.std * self.std)) - self.edge) / self.norm
             }
-            Kernel::Bspline => {
+            Kernel::Bspline | Kernel::Interpolating => {
                 let step = 0.5 * self.radius;
                 let (t, rest) = (u.abs() / step, 2.0 - u.abs() / step);
                 let near = 2.0 / 3.0 + t * t * (0.5 * t - 1.0);
@@ -96,7 +96,7 @@ impl Profile {
                 let square = self.std * self.std;
                 -u / square * libm::exp(-u * u / (2.0 * square)) / self.norm
             }
-            Kernel::Bspline => {
+            Kernel::Bspline | Kernel::Interpolating => {
                 let step = 0.5 * self.radius;
                 let (t, rest) = (u.abs() / step, 2.0 - u.abs() / step);
                 let slope = if t < 1.0 { t * (1.5 * t - 2.0) } else { -0.5 * rest * rest };
@@ -111,7 +111,7 @@ impl Profile {
     pub fn transform_at(&self, frequency: f64) -> f64 {
         let splines = match self.kernel {
             // Of a B-spline: a power of sinc.
-            Kernel::Bspline => Some((4, 0.5 * self.radius)),
+            Kernel::Bspline | Kernel::Interpolating => Some((4, 0.5 * self.radius)),
             Kernel::Tent => Some((2, self.radius)),
             Kernel::Gaussian => None,
         };
@@ -151,7 +151,7 @@ impl Profile {
                         + libm::erf(self.radius / (self.std * root2)));
                 return (bell - self.edge * (u + self.radius)) / self.norm;
             }
-            Kernel::Bspline => u / (0.5 * self.radius),
+            Kernel::Bspline | Kernel::Interpolating => u / (0.5 * self.radius),
             Kernel::Tent => u / self.radius,
         };
         if steps < 0.0 { 0.5 - half(-steps) } else { 0.5 + half(steps) }
@@ -166,7 +166,7 @@ impl Profile {
                 let bell = -square * libm::expm1(-u * u / (2.0 * square));
                 (bell - 0.5 * self.edge * u * u) / self.norm
             }
-            Kernel::Bspline => {
+            Kernel::Bspline | Kernel::Interpolating => {
                 let step = 0.5 * self.radius;
                 let (t, rest) = (u / step, 2.0 - u / step);
                 let (square, fourth) = (t * t, rest * rest * rest * rest);

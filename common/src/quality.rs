@@ -13,6 +13,10 @@ pub enum Kernel {
     /// Cubic B-spline: a constant field stays constant along the lattice's axes, and within 1 %
     /// from any side.
     Bspline,
+    /// Cubic B-spline of coefficients instead of values: a field that passes through the samples, seen
+    /// along the lattice's axes, and nearly so from any side (Unser, "Splines: a perfect fit", 1999). The
+    /// sharpest; it overshoots beside edges. With [`Classify::After`] alone.
+    Interpolating,
     /// Tent, the linear B-spline. Sharpest, and of a constant field from a slanted side up to 39 %
     /// ripple (docs/design/numerics.md section 4).
     Tent,
@@ -184,16 +188,17 @@ impl Quality {
     pub fn kernel_shape(&self) -> [f64; 2] {
         match self.kernel {
             Kernel::Gaussian => [self.std, self.radius],
-            Kernel::Bspline => [(1.0f64 / 3.0).sqrt(), 2.0],
+            Kernel::Bspline | Kernel::Interpolating => [(1.0f64 / 3.0).sqrt(), 2.0],
             Kernel::Tent => [(1.0f64 / 6.0).sqrt(), 1.0],
         }
     }
 
-    /// Returns whether 16-bit sums have room for a sheet's ripple. They have none for a tent, a
-    /// narrow or wide Gaussian, or the paper's opacities, which add up to more than one.
+    /// Returns whether 16-bit sums have room for a sheet's ripple. They have none for a tent,
+    /// coefficients that overshoot, a narrow or wide Gaussian, or the paper's opacities, which add up to more than one.
     pub fn fits_i16(&self) -> bool {
         let even = self.kernel != Kernel::Gaussian || (self.std >= 0.5 && self.radius <= 2.0);
-        self.compositing != Compositing::Paper && self.kernel != Kernel::Tent && even
+        let narrow = matches!(self.kernel, Kernel::Tent | Kernel::Interpolating);
+        self.compositing != Compositing::Paper && !narrow && even
     }
 
     /// Checks that every number of the quality is in its range.
@@ -225,10 +230,18 @@ impl Quality {
         if self.classify == Classify::After {
             self.check_after()?;
         }
-        if self.kernel == Kernel::Tent && self.sums == Sums::I16 {
+        if self.kernel == Kernel::Interpolating && self.classify == Classify::Before {
+            return Err(InvalidField::new(
+                "kernel",
+                "`interpolating` reconstructs values; use it with `--classify after`, or `bspline`",
+            ));
+        }
+        let rough = matches!(self.kernel, Kernel::Tent | Kernel::Interpolating);
+        if rough && self.sums == Sums::I16 {
             return Err(InvalidField::new(
                 "sums",
-                "`i16` has no room for the ripple of the `tent` kernel; use `i32` or `auto`",
+                "`i16` has no room for the ripple of the `tent` and `interpolating` kernels; use \
+                 `i32` or `auto`",
             ));
         }
         if self.splat != Splat::Direct {

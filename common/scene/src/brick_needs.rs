@@ -7,7 +7,7 @@ use crate::path::{CropBox, ViewPath};
 use crate::tween::Tween;
 use sha2::{Digest, Sha256};
 use slabcast_common::brick::BrickSetKey;
-use slabcast_common::quality::{Classify, InvalidField, Keep, Quality};
+use slabcast_common::quality::{Classify, InvalidField, Keep, Kernel, Quality};
 use slabcast_common::transfer::{Classifier, Support, TransferFunction};
 use slabcast_common::volume::{Digest32, VolumeInfo};
 
@@ -28,6 +28,9 @@ pub struct BrickNeeds {
     /// Voxels within this many index steps of a visible one, along each axis, are stored too: what
     /// a kernel that reconstructs values near the visible ones takes in.
     pub halo: u32,
+    /// Whether bricks hold coefficients of an interpolating cubic B-spline, as 32-bit floats, in place of
+    /// values.
+    pub coefficients: bool,
     /// Box outside of which no voxel is stored; `None` for the whole volume.
     pub crop: Option<CropBox>,
 }
@@ -42,6 +45,7 @@ impl BrickNeeds {
                 normals: tf.shading.on,
                 gradients: !tf.gradient_opacity.is_empty(),
                 halo: 0,
+                coefficients: false,
                 crop: None,
             },
             Classify::After => BrickNeeds {
@@ -49,6 +53,7 @@ impl BrickNeeds {
                 normals: false,
                 gradients: false,
                 halo: HALO,
+                coefficients: quality.kernel == Kernel::Interpolating,
                 crop: None,
             },
         }
@@ -77,6 +82,7 @@ impl BrickNeeds {
             normals: a.normals || b.normals,
             gradients: a.gradients || b.gradients,
             halo: a.halo.max(b.halo),
+            coefficients: a.coefficients || b.coefficients,
             crop: None,
         });
         Ok(BrickNeeds { crop, ..union.unwrap_or_default() })
@@ -129,6 +135,9 @@ impl BrickNeeds {
             h.update(b"halo");
             h.update(self.halo.to_le_bytes());
         }
+        if self.coefficients {
+            h.update(b"coefficients");
+        }
         if let Some(crop) = &self.crop {
             h.update(b"crop");
             for x in crop.lo.to_array().into_iter().chain(crop.hi.to_array()) {
@@ -152,6 +161,7 @@ mod tests {
             normals,
             gradients: false,
             halo: 0,
+            coefficients: false,
             crop: crop.map(|c| {
                 let lattice = Lattice::from_spacing([9; 3], [1.0; 3]);
                 c.parse::<Crop>().unwrap().resolve(&lattice).unwrap()

@@ -54,6 +54,7 @@ mod nifti;
 mod nrrd;
 #[cfg(test)]
 mod phantom;
+mod prefilter;
 mod raw;
 mod samples;
 mod sketch;

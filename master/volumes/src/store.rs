@@ -7,6 +7,7 @@
 //! promise is 8, so a brick has one or the other: with workers of both kinds, the master encodes a
 //! brick anew for each remote worker.
 
+use crate::prefilter;
 use bytes::Bytes;
 use rayon::prelude::*;
 use slabcast_common::brick::{
@@ -49,18 +50,20 @@ impl BrickStore {
     /// and so are normals and gradients that `needs` does not ask for.
     pub fn build(volume: &Volume, digest: Digest32, needs: &BrickNeeds) -> Self {
         let support = &needs.support;
+        let coefficients = needs.coefficients.then(|| prefilter::coefficients(volume));
+        let coefficients = coefficients.as_deref();
         let bricks = match &volume.samples {
             Samples::U8(v) => {
                 let relevant = relevance_table(support, 256);
-                cut(volume, v, needs, Samples::U8, |c| relevant[usize::from(c)])
+                cut(volume, (v, coefficients), needs, Samples::U8, |c| relevant[usize::from(c)])
             }
             Samples::U16(v) => {
                 let relevant = relevance_table(support, 65536);
-                cut(volume, v, needs, Samples::U16, |c| relevant[usize::from(c)])
+                cut(volume, (v, coefficients), needs, Samples::U16, |c| relevant[usize::from(c)])
             }
-            Samples::F32(v) => {
-                cut(volume, v, needs, Samples::F32, |c| support.contains(f64::from(c)))
-            }
+            Samples::F32(v) => cut(volume, (v, coefficients), needs, Samples::F32, |c| {
+                support.contains(f64::from(c))
+            }),
         };
         let (infos, contents): (Vec<BrickInfo>, Vec<Mutex<Content>>) = bricks.into_iter().unzip();
         BrickStore {
@@ -165,11 +168,12 @@ pub(crate) fn relevance_table(support: &Support, codes: usize) -> Vec<bool> {
     relevant
 }
 
-/// Cuts all bricks with a relevant voxel. A task is a row of bricks along x: a 256^3 volume has
+/// Cuts all bricks with a relevant voxel, which hold `coefficients` in place of codes if there are any.
+/// A task is a row of bricks along x: a 256^3 volume has
 /// 1024 rows of 16 Ki samples, which keeps any number of cores evenly busy.
 fn cut<T: Copy + Into<f64> + Sync>(
     volume: &Volume,
-    codes: &[T],
+    (codes, coefficients): (&[T], Option<&[f32]>),
     needs: &BrickNeeds,
     samples: fn(Vec<T>) -> Samples,
     relevant: impl Fn(T) -> bool + Sync,
@@ -214,7 +218,10 @@ fn cut<T: Copy + Into<f64> + Sync>(
             let normals = needs.normals.then(|| all().map(encode_normal).collect());
             let magnitude = |g: glam::DVec3| encode_magnitude(g.length(), &volume.summary);
             let gradients = needs.gradients.then(|| all().map(magnitude).collect());
-            let values = samples(offsets.iter().map(|&o| codes[o]).collect());
+            let values = match coefficients {
+                Some(all) => Samples::F32(offsets.iter().map(|&o| all[o]).collect()),
+                None => samples(offsets.iter().map(|&o| codes[o]).collect()),
+            };
             let brick = Brick::new(id, index.to_vec(), values, normals).with_gradients(gradients);
             let info = BrickInfo {
                 id,

@@ -14,7 +14,8 @@ use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, Tran
 use slabcast_common::volume::SampleKind;
 
 enum_conversions!(kernel_to_wire, kernel_from_wire, Kernel, wire::Kernel, None,
-    { Gaussian <=> Gaussian, Bspline <=> Bspline, Tent <=> Tent });
+    { Gaussian <=> Gaussian, Bspline <=> Bspline, Tent <=> Tent,
+      Interpolating <=> Interpolating });
 enum_conversions!(classify_to_wire, classify_from_wire, Classify, wire::Classify,
     None,
     { After <=> After, Before <=> Before });

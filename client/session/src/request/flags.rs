@@ -174,13 +174,14 @@ pub struct QualityArgs {
     #[arg(long, value_name = "E", default_value = "1/512", value_parser = parse::fraction,
           allow_negative_numbers = true, hide_short_help = true)]
     eps: f64,
-    /// Reconstruction kernel: bspline, gaussian or tent [default: bspline]
+    /// Reconstruction kernel: bspline, interpolating (sharpest), gaussian or tent [default: bspline]
     ///
     /// With `--classify before` the default is gaussian. B-splines add up to one along the
     /// lattice's axes; the tent ripples by up to 39 % from other sides.
     #[arg(long, value_name = "KERNEL", hide_short_help = true,
           value_parser = words(&[("gaussian", Kernel::Gaussian), ("bspline", Kernel::Bspline),
-                                 ("tent", Kernel::Tent)]))]
+                                 ("tent", Kernel::Tent),
+                                 ("interpolating", Kernel::Interpolating)]))]
     kernel: Option<Kernel>,
     /// Standard deviation of the Gaussian kernel, in lattice steps: 0.5 sharp, 0.7 smooth
     #[arg(long, value_name = "STEPS", default_value = "0.6", value_parser = parse::number,

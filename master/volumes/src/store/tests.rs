@@ -12,7 +12,17 @@ fn span(a: f64, b: f64) -> Support {
 /// Builds a store and compares it with a plain loop over all voxels of the volume.
 fn check(volume: &Volume, support: &Support, normals: bool) -> BrickStore {
     let support = support.clone();
-    check_all(volume, &BrickNeeds { support, normals, gradients: false, halo: 0, crop: None })
+    check_all(
+        volume,
+        &BrickNeeds {
+            support,
+            normals,
+            gradients: false,
+            halo: 0,
+            coefficients: false,
+            crop: None,
+        },
+    )
 }
 
 fn check_all(volume: &Volume, needs: &BrickNeeds) -> BrickStore {
@@ -126,11 +136,13 @@ proptest! {
         let crop = crop.then(|| {
             let share = Some(f64::from(seed % 7) / 10.0);
             let x = [None, share.map(|s| s + 0.2)];
-                let crop =
-                    Crop { unit: CropUnit::Unit, x, y: [share, None], ..Crop::default() };
+            let crop = Crop { unit: CropUnit::Unit, x, y: [share, None], ..Crop::default() };
             crop.resolve(&volume.lattice).unwrap()
         });
-        check_all(&volume, &BrickNeeds { support, normals, gradients: seed % 3 == 0, halo: seed % 4, crop });
+        let gradients = seed % 3 == 0;
+        let halo = seed % 4;
+        let needs = BrickNeeds { support, normals, gradients, halo, coefficients: false, crop };
+        check_all(&volume, &needs);
     }
 }
 
@@ -190,6 +202,7 @@ fn brick_encoding_is_shared_between_threads() {
         normals: true,
         gradients: false,
         halo: 0,
+        coefficients: false,
         crop: None,
     };
     let store = BrickStore::build(&v, Digest32::default(), &needs);

@@ -45,7 +45,9 @@ impl Profile {
         let [std, radius] = quality.kernel_shape();
         match quality.kernel {
             Kernel::Gaussian => Profile::new(std, radius),
-            Kernel::Bspline => Profile { std, radius, norm: 1.0, degree: Some(3) },
+            Kernel::Bspline | Kernel::Interpolating => {
+                Profile { std, radius, norm: 1.0, degree: Some(3) }
+            }
             Kernel::Tent => Profile { std, radius, norm: 1.0, degree: Some(1) },
         }
     }

@@ -5,10 +5,10 @@ use glam::DVec3;
 use slabcast_common::crop::CropBox;
 use slabcast_common::ids::SceneId;
 use slabcast_common::message::SceneSpec;
-use slabcast_common::quality::{Quality, Sums};
+use slabcast_common::quality::{Kernel, Quality, Sums};
 use slabcast_common::transfer::OpacityUnit;
 use slabcast_common::view::{Camera, CameraProjection, View};
-use slabcast_common::volume::{Digest32, Volume};
+use slabcast_common::volume::{Digest32, SampleKind, Samples, Volume};
 use slabcast_render::judge::reference::FieldReference;
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
@@ -74,14 +74,35 @@ fn constant_volume_is_drawn_at_full_strength_up_to_its_faces() {
     }
 }
 
-/// Crop, opacity by gradient, light, an oblique lattice: pixels are those of the f64 limit.
-#[test]
-fn cropped_and_modulated_pictures_approach_the_limit() {
+/// Waves between 18 and 238 on an oblique lattice.
+fn waves() -> Volume {
     let mut volume = Volume::from_fn_u8("waves", [22, 20, 24], |i, j, k| {
         let [x, y, z] = [i, j, k].map(f64::from);
         (128.0 + 60.0 * (x * 0.45).sin() + 50.0 * (y * 0.38 + z * 0.3).cos()) as u8
     });
     volume.lattice.steps[0].y = 0.3;
+    volume
+}
+
+/// Crop, opacity by gradient, light, an oblique lattice: pixels are those of the f64 limit.
+#[test]
+fn cropped_and_modulated_pictures_approach_the_limit() {
+    approach_the_limit(&waves(), Kernel::Bspline);
+}
+
+/// The same for coefficients, some of which lie beyond the smallest and the largest value.
+#[test]
+fn pictures_of_coefficients_approach_the_limit() {
+    let mut volume = waves();
+    let all = (0..volume.samples.len()).map(|i| volume.samples.code(i) as f32).collect();
+    volume.samples = Samples::F32(all);
+    volume.summary.kind = SampleKind::F32;
+    (volume.summary.min_code, volume.summary.max_code) = (40.0, 210.0);
+    approach_the_limit(&volume, Kernel::Interpolating);
+}
+
+/// Draws `volume` in parallel and in perspective views, with planes of 1 and 1/2 vox.
+fn approach_the_limit(volume: &Volume, kernel: Kernel) {
     let colours = vec![[0.0, 1.0, 0.2, 0.1], [128.0, 0.8, 0.8, 0.2], [255.0, 0.1, 0.5, 1.0]];
     let visible = vec![[0.0, 0.0], [120.0, 0.0], [150.0, 0.15], [255.0, 0.6]];
     let mut tf = transfer(colours, visible, OpacityUnit::AlphaPerVox);
@@ -100,7 +121,8 @@ fn cropped_and_modulated_pictures_approach_the_limit() {
         };
         let mut errors = Vec::new();
         for thickness in [1.0, 0.5] {
-            let quality = Quality { eps: 0.0, sums: Sums::I32, thickness, ..Quality::default() };
+            let quality =
+                Quality { eps: 0.0, sums: Sums::I32, thickness, kernel, ..Quality::default() };
             let spec = SceneSpec {
                 id: SceneId(1),
                 volume: volume.info(Digest32::default()),
@@ -109,7 +131,7 @@ fn cropped_and_modulated_pictures_approach_the_limit() {
                 crop: Some(crop),
                 bricks: Default::default(),
             };
-            let bricks = bricks_of(&volume);
+            let bricks = bricks_of(volume);
             let view = View::new(&volume.lattice, &camera, [48; 2], &quality).expect("a camera");
             let picture = serial::render(&Frame::new(Arc::new(Scene::new(&spec)), view), &bricks);
             let reference = FieldReference::new(&spec, view, &bricks);

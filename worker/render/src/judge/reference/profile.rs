@@ -56,7 +56,7 @@ impl Profile {
         // Values and slopes of B-splines at their knots, in steps.
         match kernel {
             Kernel::Gaussian => Profile::gaussian(std, radius),
-            Kernel::Bspline => {
+            Kernel::Bspline | Kernel::Interpolating => {
                 Profile::pieces(radius, &[[2.0 / 3.0, 0.0], [1.0 / 6.0, -0.5], [0.0, 0.0]])
             }
             Kernel::Tent => Profile::pieces(radius, &[[1.0, -1.0], [0.0, -1.0]]),

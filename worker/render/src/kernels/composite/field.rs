@@ -136,7 +136,7 @@ impl Faces {
 #[derive(Debug)]
 pub struct FieldRule {
     /// Raw units of a sum for one code; times the lattice's cell and over the factors of the
-    /// weights, for payloads.
+    /// weights, for payloads. Negative where the background is the largest code.
     scale: f32,
     /// Factor of codes before the background is taken away, which has it too ([`shrink`]).
     shrink: f32,
@@ -268,11 +268,11 @@ impl FieldRule {
         let payload = if short { spread.x * spread.y * spread.z } else { 1.0 };
         let shrink = shrink(scene);
         FieldRule {
-            scale: (units * view.cell / payload / shrink) as f32,
+            scale: (sign * units * view.cell / payload / shrink) as f32,
             shrink: shrink as f32,
             background: (scene.background * shrink) as f32,
-            smallest: scene.range[0] as f32,
-            largest: scene.range[1] as f32,
+            smallest: scene.ends[0] as f32,
+            largest: scene.ends[1] as f32,
             kind: scene.kind,
             cell: [((scene.background - scene.hull[0]) * cells) as f32, per_raw as f32],
             slopes,
@@ -304,7 +304,7 @@ impl FieldRule {
     }
 
     /// Returns what a voxel adds to a sum for each unit of weight, from its sample's bits: 0 for
-    /// the background and for NaN.
+    /// the background and for NaN. Only coefficients beyond the background give less than 0.
     #[inline(always)]
     pub fn payload(&self, bits: u32) -> f32 {
         let code = match self.kind {
@@ -317,7 +317,7 @@ impl FieldRule {
                 code.clamp(self.smallest, self.largest)
             }
         };
-        (code * self.shrink - self.background).abs() * self.scale
+        (code * self.shrink - self.background) * self.scale
     }
 
     /// The ray of the pixel at a column and a row of the picture.

@@ -55,6 +55,7 @@ use glam::{DMat3, DVec3};
 use looks::{Emission, Lamp, Looks, emission};
 use slabcast_common::brick::{Brick, BrickGrid, local_position};
 use slabcast_common::message::SceneSpec;
+use slabcast_common::quality::Kernel;
 use slabcast_common::view::{NEAR, Projection, View};
 use std::sync::Arc;
 use sums::{Line, Near};
@@ -138,7 +139,10 @@ impl FieldReference {
             })
         });
         let crop = crop.collect();
-        let codes = dense(dims, bricks, [looks.min_code, looks.max_code]);
+        let range = looks.max_code - looks.min_code;
+        // Coefficients overshoot.
+        let beyond = if spec.quality.kernel == Kernel::Interpolating { range } else { 0.0 };
+        let codes = dense(dims, bricks, [looks.min_code - beyond, looks.max_code + beyond]);
         let blocks = Blocks::new(dims, &codes, reach, |lo, hi| looks.visible(lo, hi));
         FieldReference {
             view,

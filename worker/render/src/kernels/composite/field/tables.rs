@@ -3,6 +3,7 @@
 use crate::kernels::truncate;
 use glam::DVec3;
 use slabcast_common::message::SceneSpec;
+use slabcast_common::quality::Kernel;
 use slabcast_common::transfer::{Classifier, OpticalSample};
 use slabcast_common::volume::{SampleKind, ValueSummary};
 
@@ -73,12 +74,16 @@ pub struct FieldScene {
     pub(super) crop: Vec<CropFaces>,
     /// Smallest and largest code.
     pub(super) range: [f64; 2],
+    /// Smallest and largest number that bricks hold: codes, or coefficients of an interpolating kernel,
+    /// which are cut off at all codes' length beyond them.
+    pub(super) ends: [f64; 2],
     /// Codes from the smallest to the largest; of a constant volume a length that is not zero.
     pub(super) span: f64,
     /// Codes of the first and the last cell's ends.
     pub(super) hull: [f64; 2],
     /// Cells between which values are visible: a visible end of the hull has no end.
     pub(super) visible: [f32; 2],
+    /// Number type of what bricks hold.
     pub(super) kind: SampleKind,
     /// Extinction per vox and linear colour by cell end.
     pub(super) looks: Box<[OpticalSample; CELLS + 1]>,
@@ -125,6 +130,8 @@ impl FieldScene {
             integrals.push(sum);
         }
         let cells_of_range = span(summary) * CELLS as f64 / (hull[1] - hull[0]);
+        let coefficients = spec.quality.kernel == Kernel::Interpolating;
+        let beyond = if coefficients { span(summary) } else { 0.0 };
         let mut most = 0.0f64;
         let sample = |[sigma, rgb @ ..]: [f64; 4]| OpticalSample {
             sigma: sigma as f32,
@@ -145,9 +152,10 @@ impl FieldScene {
             crop: crop.filter(|f| f.ends.iter().any(|end| end.is_finite())).collect(),
             range: [summary.min_code, summary.max_code],
             span: span(summary),
+            ends: [summary.min_code - beyond, summary.max_code + beyond],
             hull,
             visible,
-            kind: summary.kind,
+            kind: if coefficients { SampleKind::F32 } else { summary.kind },
             shares: GradientShares::new(classifier, cells_of_range),
             most: table(looks.iter().map(|look| {
                 most = most.max(look[0]);
@@ -168,9 +176,9 @@ impl FieldScene {
         self.hull[0] + value / self.cells_per_code()
     }
 
-    /// Largest difference of a code from the background.
+    /// Largest difference of a number that bricks hold from the background.
     pub(super) fn reach(&self) -> f64 {
-        let [lo, hi] = self.range.map(|end| (end - self.background).abs());
+        let [lo, hi] = self.ends.map(|end| (end - self.background).abs());
         // All codes are one invisible one.
         if lo.max(hi) > 0.0 { lo.max(hi) } else { self.span }
     }

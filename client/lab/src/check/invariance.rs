@@ -10,7 +10,7 @@
 use super::case::{Case, Row};
 use super::changes::Turn;
 use super::invariance_scenes::{
-    BYTES, Effort, InvarianceCase, LARGEST, Scene, VIEWS, cropped, largest, mirrored,
+    BYTES, Effort, FIELD_SUMS, InvarianceCase, LARGEST, Scene, VIEWS, cropped, largest, mirrored,
     pixels_that_differ, rolled,
 };
 use super::shot::{ReferenceKind, Shot};
@@ -29,11 +29,6 @@ use slabcast_session::fail::Fail;
 /// as 5 % of a voxel's weight may move by two steps, which bounds nothing; 0.2 to 0.5 is what it
 /// comes to.
 const CUT_OTHERWISE: f64 = 1.0;
-
-/// Largest difference of two ways to sum one field, in 1/255: the transfer function's table begins and
-/// ends within one code of what is visible, so it has other cells for other types of samples; 32-bit
-/// sums have other units. 0.016 was the largest seen.
-pub(super) const FIELD_SUMS: f64 = 0.05;
 
 /// Largest difference of a field's opacity from the front and from behind, in 1/255. Planes are the
 /// same, but segments are cut into sub-steps from the eye's side, which may cost 0.05, and gradients

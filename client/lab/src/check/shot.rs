@@ -77,7 +77,7 @@ pub(crate) struct PreparedShot {
 
 impl Shot {
     fn path(&self) -> ViewPath {
-        ViewPath { crop: self.crop.clone(), ..ViewPath::from_views(self.size, vec![self.view]) }
+        ViewPath { crop: self.crop, ..ViewPath::from_views(self.size, vec![self.view]) }
     }
 
     /// Returns the request that has a cluster draw the shot.

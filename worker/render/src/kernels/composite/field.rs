@@ -517,7 +517,7 @@ impl FieldRule {
         (row, i): (&mut Row, usize),
         (pixel, k): ([i32; 2], i32),
     ) {
-        if row.here[0][i] <= 0.0 {
+        if row.here[0][i] == 0.0 {
             return;
         }
         let h = self.thickness;

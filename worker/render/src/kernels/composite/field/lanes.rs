@@ -438,7 +438,8 @@ unsafe fn close<L: Floats>(
     unsafe {
         let (zero, one) = (L::all(0.0), L::all(1.0));
         let here = load::<L>(&row.here[0], at_lane);
-        let some = L::bits(L::below(zero, here)) & live;
+        // Sums of coefficients may be negative.
+        let some = (L::bits(L::below(zero, here)) | L::bits(L::below(here, zero))) & live;
         if some == 0 {
             return 0;
         }

@@ -99,6 +99,10 @@ impl FieldScene {
     /// Prepares the values of the scene that `spec` describes.
     pub fn new(spec: &SceneSpec, classifier: &Classifier) -> FieldScene {
         let summary = &spec.volume.summary;
+        let coefficients = spec.quality.kernel == Kernel::Interpolating;
+        let beyond = if coefficients { span(summary) } else { 0.0 };
+        let ends = [summary.min_code - beyond, summary.max_code + beyond];
+        let hull = hull(classifier, summary, ends);
         let support = classifier.support();
         let end = match support.filled(summary).intervals.first() {
             Some((lo, _)) if *lo == f64::NEG_INFINITY => summary.max_code,
@@ -109,13 +113,12 @@ impl FieldScene {
             true => summary.min_code - span(summary) * BELOW,
             false => end,
         };
-        let hull = hull(classifier, summary);
         let code = |cell: usize| hull[0] + (hull[1] - hull[0]) * (cell as f64 / CELLS as f64);
         let looks: Vec<[f64; 4]> = (0..=CELLS).map(|c| classifier.optics_at(code(c))).collect();
-        let ends = [0, CELLS].map(|cell| looks[cell][0] > 0.0);
+        let shows = [0, CELLS].map(|cell| looks[cell][0] > 0.0);
         let visible = [
-            if ends[0] { f32::NEG_INFINITY } else { 0.0 },
-            if ends[1] { f32::INFINITY } else { CELLS as f32 },
+            if shows[0] { f32::NEG_INFINITY } else { 0.0 },
+            if shows[1] { f32::INFINITY } else { CELLS as f32 },
         ];
         let mut integrals = vec![[0.0f64; 4]];
         for pair in looks.windows(2) {
@@ -130,8 +133,6 @@ impl FieldScene {
             integrals.push(sum);
         }
         let cells_of_range = span(summary) * CELLS as f64 / (hull[1] - hull[0]);
-        let coefficients = spec.quality.kernel == Kernel::Interpolating;
-        let beyond = if coefficients { span(summary) } else { 0.0 };
         let mut most = 0.0f64;
         let sample = |[sigma, rgb @ ..]: [f64; 4]| OpticalSample {
             sigma: sigma as f32,
@@ -152,7 +153,7 @@ impl FieldScene {
             crop: crop.filter(|f| f.ends.iter().any(|end| end.is_finite())).collect(),
             range: [summary.min_code, summary.max_code],
             span: span(summary),
-            ends: [summary.min_code - beyond, summary.max_code + beyond],
+            ends,
             hull,
             visible,
             kind: if coefficients { SampleKind::F32 } else { summary.kind },
@@ -196,8 +197,8 @@ fn table<T: Copy>(entries: impl Iterator<Item = T>) -> Box<[T; CELLS + 1]> {
     all.try_into().unwrap_or_else(|_| unreachable!("an entry for each end of a cell"))
 }
 
-/// Smallest and largest code between which a value may be visible.
-fn hull(classifier: &Classifier, summary: &ValueSummary) -> [f64; 2] {
+/// Smallest and largest code between which a value may be visible, of those from end to end.
+fn hull(classifier: &Classifier, summary: &ValueSummary, ends: [f64; 2]) -> [f64; 2] {
     let support = classifier.support();
     let (lo, hi) = match (support.intervals.first(), support.intervals.last()) {
         (Some(&(lo, _)), Some(&(_, hi))) => (lo, hi),
@@ -206,7 +207,9 @@ fn hull(classifier: &Classifier, summary: &ValueSummary) -> [f64; 2] {
     // The transfer function is linear between codes: of whole codes it begins to show within one.
     let beside = if summary.kind == SampleKind::F32 { 0.0 } else { 1.0 };
     let clamp = |code: f64| code.clamp(summary.min_code, summary.max_code);
-    let [lo, hi] = [clamp(lo - beside), clamp(hi + beside)];
+    // What is beyond a visible end looks like it.
+    let lo = if lo <= summary.min_code { ends[0] } else { clamp(lo - beside) };
+    let hi = if hi >= summary.max_code { ends[1] } else { clamp(hi + beside) };
     if hi > lo { [lo, hi] } else { [lo, lo + span(summary)] }
 }
 

@@ -11,8 +11,9 @@ use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
 use slabcast_proto::model::Worker;
 use slabcast_schedule::{WorkerIdentity, WorkerView};
 use std::collections::BTreeMap;
+use std::net::{IpAddr, SocketAddr};
 use std::ops::RangeInclusive;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Bytes of bricks that a worker may hold: one brick at least, and what a process can address at most
 /// (2^47).
@@ -76,6 +77,16 @@ pub enum AttachError {
          the master without"
     )]
     Draws,
+    /// The worker drew false pixels before.
+    #[error(
+        "a worker of this name or address drew other pixels than others and is shut out for {} \
+         minutes more; see the master's log",
+        left.as_secs().div_ceil(60)
+    )]
+    ShutOut {
+        /// Time until it is let in again.
+        left: Duration,
+    },
     /// The master is shutting down.
     #[error("the master is shutting down; come back later")]
     ShuttingDown,
@@ -126,6 +137,8 @@ pub(crate) struct Admitted {
     pub(crate) worker: WorkerId,
     /// Whether it draws on the master's machine.
     pub(crate) is_local: bool,
+    /// Whether its pixels are believed without audits.
+    pub(crate) is_trusted: bool,
     /// What it is over all its links.
     pub(crate) identity: WorkerIdentity,
 }
@@ -148,12 +161,64 @@ pub(crate) struct WorkerTable {
     machine: String,
     /// Milliseconds between pings, as workers are told.
     heartbeat_ms: u32,
+    /// Which workers are audited, and for how long liars are shut out.
+    audits: Audits,
+    /// Liars, each with the end of its time: what it is, and its address without port.
+    shut_out: Vec<(WorkerIdentity, Option<IpAddr>, Instant)>,
 }
+
+/// Which workers are audited, and for how long those that lied are shut out.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Audits {
+    /// All workers over TCP, not only those of other machines.
+    pub(crate) everybody: bool,
+    /// Nobody.
+    pub(crate) nobody: bool,
+    pub(crate) shut_out: Duration,
+}
+
+/// Liars that are remembered. The one that came first is forgotten first.
+const MAX_SHUT_OUT: usize = 4096;
 
 impl WorkerTable {
     /// A table without workers. Workers give a master up after three times `heartbeat_ms`.
-    pub(crate) fn new(rehearses: bool, machine: String, heartbeat_ms: u32) -> Self {
-        WorkerTable { attached: BTreeMap::new(), next_id: 1, rehearses, machine, heartbeat_ms }
+    pub(crate) fn new(rehearses: bool, machine: String, heartbeat_ms: u32, audits: Audits) -> Self {
+        WorkerTable {
+            attached: BTreeMap::new(),
+            next_id: 1,
+            rehearses,
+            machine,
+            heartbeat_ms,
+            audits,
+            shut_out: Vec::new(),
+        }
+    }
+
+    /// Closes the link of a worker that lied, and lets neither it nor others of its address in for a
+    /// while. The master's own machine is shut to no one but the liar.
+    pub(crate) fn shut_out(&mut self, worker: WorkerId, identity: WorkerIdentity) -> Duration {
+        let gone = self.attached.remove(&worker);
+        let ip = gone.and_then(|w| Some(w.address.parse::<SocketAddr>().ok()?.ip()));
+        let ip = ip.filter(|ip| !ip.is_loopback());
+        if self.shut_out.len() >= MAX_SHUT_OUT {
+            self.shut_out.remove(0);
+        }
+        self.shut_out.push((identity, ip, Instant::now() + self.audits.shut_out));
+        self.audits.shut_out
+    }
+
+    /// Refuses a worker that is shut out.
+    fn check_shut_out(&mut self, who: &WorkerIdentity, address: &str) -> Result<(), AttachError> {
+        let now = Instant::now();
+        self.shut_out.retain(|(_, _, until)| now < *until);
+        let ip = address.parse::<SocketAddr>().ok().map(|s| s.ip());
+        let is_it = |(liar, of, _): &&(WorkerIdentity, Option<IpAddr>, Instant)| {
+            liar == who || of.is_some() && *of == ip
+        };
+        match self.shut_out.iter().find(is_it) {
+            Some((_, _, until)) => Err(AttachError::ShutOut { left: *until - now }),
+            None => Ok(()),
+        }
     }
 
     /// Lets a worker in and welcomes it.
@@ -167,10 +232,16 @@ impl WorkerTable {
         link: WorkerLink,
     ) -> Result<Admitted, AttachError> {
         let protocol_version = check(hello, self.rehearses)?;
+        let identity =
+            WorkerIdentity { host: caller.host(&hello.machine), name: hello.name.clone() };
+        self.check_shut_out(&identity, &caller.address)?;
         let worker = WorkerId(self.next_id);
         self.next_id += 1;
         // A worker that rehearses stands for one on another machine.
         let is_local = caller.is_on(&hello.machine, &self.machine) && !hello.rehearses;
+        let is_here = caller.address.is_empty() || is_local && !self.audits.everybody;
+        // A rehearsal draws nothing that could be compared.
+        let is_trusted = is_here || self.audits.nobody || hello.rehearses;
         let heartbeat_ms = self.heartbeat_ms;
         let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms, protocol_version });
         let now = Instant::now();
@@ -189,7 +260,7 @@ impl WorkerTable {
             leaving: false,
         };
         self.attached.insert(worker, attached);
-        Ok(Admitted { worker, is_local, identity })
+        Ok(Admitted { worker, is_local, is_trusted, identity })
     }
 
     /// Notes that a worker said `message`; false if there is no such worker.
@@ -260,6 +331,31 @@ impl WorkerTable {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn liar_is_shut_out_by_name_and_address_but_not_the_masters_machine() {
+        let audits = Audits { everybody: true, nobody: false, shut_out: Duration::from_secs(600) };
+        let mut table = WorkerTable::new(false, "here".into(), 1000, audits);
+        let admit = |table: &mut WorkerTable, name: &str, address: &str| {
+            let link = WorkerLink {
+                control: tokio::sync::mpsc::unbounded_channel().0,
+                bricks: tokio::sync::mpsc::unbounded_channel().0,
+                damaged: crate::link::Damaged::default(),
+            };
+            let caller = Caller { address: address.into(), is_local: false };
+            table.admit(&Hello { name: name.into(), ..hello() }, caller, link)
+        };
+        for (address, neighbour) in [("10.0.0.1:5", false), ("127.0.0.1:5", true)] {
+            let liar = admit(&mut table, "liar", address).expect("nothing is known of it");
+            table.shut_out(liar.worker, liar.identity);
+            let again = admit(&mut table, "liar", address).map(|_| ());
+            let refused = again.expect_err("it lied").to_string();
+            assert!(refused.contains("shut out for 10 minutes more"), "{refused}");
+            let other = admit(&mut table, "other", &address.replace(":5", ":77"));
+            assert_eq!(other.is_ok(), neighbour, "{address}");
+        }
+        assert!(admit(&mut table, "liar", "10.0.0.2:5").is_ok(), "somebody else's name");
+    }
 
     fn hello() -> Hello {
         Hello {

@@ -283,12 +283,16 @@ impl Driver {
             %worker, name, threads = hello.threads, simd = hello.simd,
             held_bricks = hello.held.iter().map(|h| h.1.len()).sum::<usize>(), "worker joined"
         );
+        if !admitted.is_trusted && self.workers.len() == 1 {
+            info!(%worker, "no other worker is here to compare its pixels with: no audits");
+        }
         self.scheduler.handle(
             &self.clock,
             Happened::WorkerJoined {
                 worker,
                 name,
                 identity: admitted.identity,
+                is_trusted: admitted.is_trusted,
                 threads: hello.threads,
                 is_local: admitted.is_local,
                 memory_budget_bytes: hello.memory_budget_bytes,

@@ -1,6 +1,6 @@
 //! Starting a master, and the handle by which links, services and embedding programs speak to it.
 
-use crate::admission::{AttachError, WorkerTable};
+use crate::admission::{AttachError, Audits, WorkerTable};
 use crate::driver::{Driver, Event};
 use crate::finishers::Finishers;
 use crate::hooks::{Hooks, Stage};
@@ -19,7 +19,7 @@ use slabcast_scene::path::Orientation;
 use slabcast_scene::request::PathRequest;
 use std::net::IpAddr;
 use std::sync::Arc;
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
 /// Requests that are checked at a time: with two, one whose bricks are looked through for its
@@ -45,6 +45,12 @@ pub struct MasterConfig {
     pub schedule: slabcast_schedule::Config,
     /// Recorder of the scheduler's events and decisions ([`crate::record::start`]).
     pub record: Option<Recorder>,
+    /// Share of the tiles of workers over TCP which another worker draws too, to compare, in
+    /// millionths, once each has agreed with others some times; 0: never. `None`: 1 %, of workers on
+    /// other machines.
+    pub audit_ppm: Option<u32>,
+    /// Time for which a worker is not let in after it drew other pixels than others.
+    pub shut_out: Duration,
     /// Whether to let in only workers that rehearse, and mark the pictures.
     pub rehearse: bool,
     /// Name of this machine, by which its workers are told from others'; empty if unknown.
@@ -64,6 +70,8 @@ impl MasterConfig {
             show_names: false,
             schedule: slabcast_schedule::Config::default(),
             record: None,
+            audit_ppm: None,
+            shut_out: Duration::from_secs(3600),
             rehearse: false,
             machine: String::new(),
             hooks: Hooks::default(),
@@ -130,8 +138,16 @@ impl Master {
         // A worker gives its master up after three heartbeats, as the master gives up a worker
         // after `silence`.
         let heartbeat_ms = (config.schedule.silence / 3000).min(u32::MAX.into()) as u32;
-        let workers = WorkerTable::new(config.rehearse, config.machine, heartbeat_ms);
-        let scheduler = RecordedScheduler::new(config.schedule, config.record);
+        let audits = Audits {
+            everybody: config.audit_ppm.is_some(),
+            nobody: config.audit_ppm == Some(0),
+            shut_out: config.shut_out,
+        };
+        let workers = WorkerTable::new(config.rehearse, config.machine, heartbeat_ms, audits);
+        let mut schedule = config.schedule;
+        schedule.audit_ppm = config.audit_ppm.unwrap_or(schedule.audit_ppm);
+        schedule.audit_seed = getrandom::u64().map_err(std::io::Error::other)?;
+        let scheduler = RecordedScheduler::new(schedule, config.record);
         let driver = Driver::new(
             (config.volume, served),
             config.shares,

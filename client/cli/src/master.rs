@@ -16,6 +16,7 @@ use slabcast_session::request::AxisArgs;
 use slabcast_session::{parse, record, runtime, signals, volume};
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::time::Duration;
 use tokio::net::{TcpListener, TcpSocket};
 use tokio::sync::watch;
 use tracing::{info, warn};
@@ -76,6 +77,18 @@ pub(crate) struct MasterArgs {
     /// Events and decisions of the scheduler, for `slabcast lab replay`; some 25 KB a frame
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    /// Share of each worker's tiles that another draws too, to compare; 0 for none [default: 1% of
+    /// workers on other machines]
+    ///
+    /// Of a new worker the first sixteen tiles are compared. Given a share, workers on the master's
+    /// machine are compared, too. One that drew something else than two others, or than one on the
+    /// master's machine that is not compared, is shut out. A worker alone can't be compared.
+    #[arg(long, value_name = "SHARE", value_parser = parse::share)]
+    audit: Option<f64>,
+    /// Minutes for which a worker that drew false pixels is shut out, by name and address
+    #[arg(long, value_name = "MINUTES", default_value = "60", hide_short_help = true,
+          value_parser = clap::value_parser!(u32).range(1..=525_600))]
+    shut_out: u32,
     /// Take workers that hold tiles for recorded times (`slabcast worker --rehearse`), and no
     /// others; pictures are marked all over
     #[arg(long, value_parser = clap::builder::FalseyValueParser::new())]
@@ -107,6 +120,8 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
     config.show_names = args.show_names;
     raise_files();
     config.rehearse = args.rehearse;
+    config.audit_ppm = args.audit.map(|share| (share * 1e6).ceil() as u32);
+    config.shut_out = Duration::from_secs(60 * u64::from(args.shut_out));
     config.machine = boot_id();
     if args.rehearse {
         warn!("--rehearse: this master's pictures are stripes, whatever is asked for");

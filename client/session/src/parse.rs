@@ -48,6 +48,19 @@ pub fn fraction(text: &str) -> Result<f64, String> {
     if x.is_finite() { Ok(x) } else { Err(bad()) }
 }
 
+/// Parses a share from 0 to 1, also as a fraction (`1/100`) or in per cent (`1%`).
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
+pub fn share(text: &str) -> Result<f64, String> {
+    let bad = || "give a share from 0 to 1, like 1%, 0.01 or 1/100".to_string();
+    let x = match text.trim().strip_suffix('%') {
+        Some(percent) => number(percent).map_err(|_| bad())? / 100.0,
+        None => fraction(text).map_err(|_| bad())?,
+    };
+    if (0.0..=1.0).contains(&x) { Ok(x) } else { Err(bad()) }
+}
+
 /// Parses a time with its unit (`100ms`, `0.5s`) into ms.
 ///
 /// # Errors
@@ -507,6 +520,17 @@ mod tests {
         assert_eq!(frames("0..0"), Ok(Frames::Range([0, 0])));
         for bad in ["", "0", "-1", "5..3", "3..", "..3", "1..2..3", "100001", "0..100000", "x"] {
             assert!(frames(bad).unwrap_err().contains("30..60"), "{bad}");
+        }
+    }
+
+    #[test]
+    fn shares_are_numbers_fractions_or_per_cent() {
+        for (text, want) in [("0", 0.0), ("1", 1.0), ("1%", 0.01), ("1/100", 0.01), ("100 %", 1.0)]
+        {
+            assert_eq!(share(text), Ok(want), "{text}");
+        }
+        for bad in ["", "%", "2", "-1%", "101%", "nan", "one"] {
+            assert!(share(bad).unwrap_err().contains("1%"), "{bad}");
         }
     }
 

@@ -1,6 +1,6 @@
 //! Actions: the scheduler's outputs, which its driver carries out; and views of its state.
 
-use crate::{Micros, Spans};
+use crate::{Micros, Spans, WorkerIdentity};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, FrameId, WorkerId};
 use slabcast_common::image::{FrameState, SparseTile};
@@ -76,6 +76,24 @@ pub enum Action {
         reason: String,
         /// The tile.
         tile: PoisonedTile,
+    },
+    /// A worker drew other pixels than two others, or than one that is trusted. The scheduler has
+    /// forgotten it: close its link and let it in no more.
+    ShutOut {
+        /// The worker's last id.
+        worker: WorkerId,
+        /// What it is over all its links.
+        identity: WorkerIdentity,
+        /// The frame.
+        frame: FrameId,
+        /// The tile, in pixels.
+        tile: Rect,
+    },
+    /// A frame has tiles of a worker that was shut out, which nobody has compared. The scheduler has
+    /// forgotten the frame: queue it again, under a new id.
+    FrameTainted {
+        /// The frame.
+        frame: FrameId,
     },
     /// A worker failed again and again: it is lent nothing for a while.
     Paused {

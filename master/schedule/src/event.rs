@@ -58,6 +58,8 @@ pub enum Event {
         identity: WorkerIdentity,
         /// Number of render threads.
         threads: u32,
+        /// Whether its pixels are believed without audits.
+        is_trusted: bool,
         /// Whether it runs on the master's host. Message handling then competes with its render
         /// threads, and its results cross no link.
         is_local: bool,

@@ -5,6 +5,7 @@ use crate::policy::active_set::{ActiveSet, FrameCost};
 use crate::policy::cost_history::CostHistory;
 use crate::policy::cost_model::CostModel;
 use crate::policy::link_use::{FrameLoad, LinkUse};
+use crate::state::audits::Lie;
 use crate::state::cluster::Cluster;
 use crate::state::frame::{Frame, Step, StepContext, send_bricks, uses_regions};
 use crate::state::given_up::GivenUp;
@@ -12,7 +13,7 @@ use crate::state::region_frame::RegionFrame;
 use crate::state::reputation::Reputations;
 use crate::state::residency::{Residency, Transfer};
 use crate::state::workers::{LANES, Newcomer, Roster, Worker};
-use crate::{Action, Clock, Config, Event, FrameJob, Micros, Totals, WorkerView};
+use crate::{Action, Clock, Config, Event, FrameJob, Micros, Totals, WorkerIdentity, WorkerView};
 use slabcast_common::ids::{SceneId, WorkerId};
 use slabcast_common::link::FRAMES_IN_FLIGHT;
 use slabcast_common::message::ToWorker;
@@ -24,6 +25,9 @@ use std::collections::{BTreeSet, VecDeque};
 /// and 24 with two, on 32 workers 10 to 11 and 13.
 const FRAMES_ON_A_SATURATED_LINK: usize = 2;
 
+/// Limit: liars that are remembered, so that each is shut out once.
+const MAX_SHUT_OUT: usize = 1024;
+
 /// Decides which brick and which tile goes to which worker, and when; see the head of the crate.
 #[derive(Debug)]
 pub struct Scheduler {
@@ -34,6 +38,8 @@ pub struct Scheduler {
     active: VecDeque<Frame>,
     /// Scenes to be forgotten when their frames are done.
     ended: BTreeSet<SceneId>,
+    /// Workers that were found to lie.
+    shut_out: BTreeSet<WorkerId>,
 }
 
 impl Scheduler {
@@ -44,6 +50,7 @@ impl Scheduler {
                 config,
                 roster: Roster::default(),
                 reputations: Reputations::default(),
+                lies: Vec::new(),
                 residency: Residency::default(),
                 history: CostHistory::default(),
                 link_use: LinkUse::default(),
@@ -57,6 +64,7 @@ impl Scheduler {
             waiting: VecDeque::new(),
             active: VecDeque::new(),
             ended: BTreeSet::new(),
+            shut_out: BTreeSet::new(),
         }
     }
 
@@ -86,6 +94,7 @@ impl Scheduler {
                 name,
                 identity,
                 threads,
+                is_trusted,
                 is_local,
                 memory_budget_bytes,
                 held,
@@ -93,7 +102,8 @@ impl Scheduler {
                 cluster.residency.join(worker, memory_budget_bytes, held);
                 let identity = cluster.roster.free_identity(identity);
                 let reputation = cluster.reputations.recall(&identity);
-                let newcomer = Newcomer { name, identity, reputation, threads, is_local };
+                let newcomer =
+                    Newcomer { name, identity, reputation, threads, is_local, is_trusted };
                 cluster.roster.join(worker, newcomer, now);
                 cluster.pause(worker, now);
                 for frame in &mut self.active {
@@ -139,7 +149,8 @@ impl Scheduler {
                         match frame.result(cluster, worker, *result, clock) {
                             Err(reason) => self.drop_worker(worker, reason, false, now),
                             Ok(rendered) => {
-                                freed_worker = (!is_due).then_some(worker);
+                                let is_entered = rendered.is_some();
+                                freed_worker = (!is_due && is_entered).then_some(worker);
                                 let from = cluster.roster.get_mut(worker);
                                 if let Some(from) = from.filter(|_| rendered.is_some()) {
                                     from.reputation.add_result();
@@ -157,6 +168,10 @@ impl Scheduler {
                         }
                     }
                     _ => cluster.totals.dropped_results += 1,
+                }
+                for lie in std::mem::take(&mut self.cluster.lies) {
+                    freed_worker = None;
+                    self.shut_out(lie, now);
                 }
             }
             Event::Failed { worker, task, epoch, reason } => {
@@ -299,6 +314,32 @@ impl Scheduler {
         self.cluster.history.rates.forget(id);
     }
 
+    /// Forgets a worker that drew false pixels, and the frames that have tiles of it which nobody
+    /// has compared.
+    fn shut_out(&mut self, lie: Lie, now: Micros) {
+        let Lie { worker, who, frame, tile } = lie;
+        // Other tiles of it may be compared after it is gone.
+        if !self.shut_out.insert(worker) {
+            return;
+        }
+        if self.shut_out.len() > MAX_SHUT_OUT {
+            self.shut_out.pop_first();
+        }
+        let agreed_at = self.cluster.roster.get(worker).map_or(0, |w| w.reputation.agreed_at);
+        let is_tainted = |f: &Frame| f.core().unaudited(worker).is_some_and(|at| at >= agreed_at);
+        let tainted: Vec<usize> =
+            (0..self.active.len()).rev().filter(|i| is_tainted(&self.active[*i])).collect();
+        self.lose(worker, false, now);
+        let identity = WorkerIdentity::clone(&who);
+        self.cluster.out.push_back(Action::ShutOut { worker, identity, frame, tile });
+        for i in tainted {
+            let Some(mut frame) = self.active.remove(i) else { continue };
+            frame.end(&mut self.cluster);
+            let frame = frame.core().job.frame;
+            self.cluster.out.push_back(Action::FrameTainted { frame });
+        }
+    }
+
     fn drop_worker(&mut self, worker: WorkerId, reason: String, blame: bool, now: Micros) {
         self.lose(worker, blame, now);
         self.cluster.out.push_back(Action::Drop { worker, reason });
@@ -322,7 +363,7 @@ impl Scheduler {
             freed_worker = None;
         }
         for frame in &mut self.active {
-            frame.tick(&mut self.cluster, now);
+            frame.tick(&mut self.cluster, clock);
         }
         while self.step_frames(freed_worker, clock) {
             freed_worker = None;

@@ -69,6 +69,7 @@ fn cost(n: u32, edge: u32, height: f64, workers: u64, work: Work) -> f64 {
             worker: WorkerId(id),
             name: format!("w{id}"),
             identity: Default::default(),
+            is_trusted: true,
             threads: 4,
             is_local: false,
             memory_budget_bytes: u64::MAX,

@@ -51,6 +51,10 @@ pub struct Audit {
     pub drops: Vec<(WorkerId, String)>,
     /// Frames that failed, with the scheduler's reasons.
     pub failed: BTreeMap<FrameId, String>,
+    /// Workers that were shut out for false pixels.
+    pub shut_out: Vec<WorkerId>,
+    /// Frames that had tiles of such workers.
+    pub tainted: Vec<FrameId>,
     /// Pauses of workers that failed again and again, in microseconds.
     pub pauses: Vec<(WorkerId, Micros)>,
     /// Number of leases that were given.
@@ -301,6 +305,18 @@ impl Observer for Audit {
                 self.note("failed", frame.0, 0, now);
                 self.jobs.get_mut(frame).expect("a frame that was queued").is_over = true;
                 self.failed.insert(*frame, reason.clone());
+            }
+            Action::ShutOut { worker, frame, .. } => {
+                self.note("shut out", worker.0, frame.0, now);
+                self.accounts.remove(worker);
+                self.dropped.insert(*worker);
+                self.shut_out.push(*worker);
+            }
+            Action::FrameTainted { frame } => {
+                self.note("tainted", frame.0, 0, now);
+                let j = self.jobs.get_mut(frame).expect("a frame that was queued");
+                assert!(!std::mem::replace(&mut j.is_over, true), "seed {seed}: {frame} twice");
+                self.tainted.push(*frame);
             }
             Action::Paused { worker, pause_us, .. } => {
                 self.note("paused", worker.0, *pause_us, now);

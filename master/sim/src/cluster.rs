@@ -251,6 +251,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
                 name: profile.name.map_or_else(|| format!("w{}", id.0), str::to_string),
             },
             threads: profile.threads,
+            is_trusted: profile.is_trusted,
             is_local: profile.is_local,
             memory_budget_bytes: profile.memory_budget_bytes,
             held: held.clone(),

@@ -184,6 +184,8 @@ pub struct WorkerProfile {
     /// Name of the worker and of its machine, by which it is known when it comes back; `None`: a
     /// worker that was never there before.
     pub name: Option<&'static str>,
+    /// Whether its pixels are believed without audits.
+    pub is_trusted: bool,
     /// Faults that the worker has by itself.
     pub faults: Faults,
 }
@@ -204,6 +206,7 @@ impl Default for WorkerProfile {
             brick_bytes_per_s: None,
             clock_ahead_us: 0,
             name: None,
+            is_trusted: true,
             faults: Faults::default(),
         }
     }
@@ -216,6 +219,8 @@ pub struct Faults {
     pub duplicate_one_in: u64,
     /// Number n for which one result, or handed-over piece, in n is malformed; 0 = never.
     pub lie_one_in: u64,
+    /// Number n for which the pixels of one result in n are false; 0 = never.
+    pub false_one_in: u64,
     /// Number n for which one task in n is refused; 0 = never.
     pub fail_one_in: u64,
     /// Number n for which one brick in n arrives damaged; 0 = never.

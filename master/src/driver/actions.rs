@@ -5,12 +5,12 @@ use crate::finish::{Assembly, FrameSums};
 use crate::finishers::FinishTask;
 use crate::jobs::{FinishedFrame, JobState};
 use crate::link::BrickOrder;
-use slabcast_common::ids::{FrameId, JobId};
+use slabcast_common::ids::{FrameId, JobId, WorkerId};
 use slabcast_common::image::{FrameState, SparseTile};
 use slabcast_common::message::ToWorker;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::stats::{FrameStats, PoisonedTile};
-use slabcast_schedule::{Action, Event as Happened, Spans};
+use slabcast_schedule::{Action, Event as Happened, Spans, WorkerIdentity};
 use std::sync::Arc;
 use tracing::{debug, info, warn};
 
@@ -57,6 +57,16 @@ impl Driver {
                 }
                 Action::FrameFailed { frame, reason, tile } => {
                     self.give_up_frame(frame, reason, &tile);
+                }
+                Action::ShutOut { worker, identity, frame, tile } => {
+                    self.shut_out(worker, identity, frame, tile);
+                }
+                Action::FrameTainted { frame } => {
+                    // It is drawn again as if it had been dropped.
+                    let Some(Flight { job, number, .. }) = self.flights.remove(&frame) else {
+                        continue;
+                    };
+                    self.jobs.lock().draw_again(job, number);
                 }
                 Action::Paused { worker, failures, pause_us } => {
                     let Some(who) = self.workers.who(worker) else { continue };
@@ -132,6 +142,30 @@ impl Driver {
         if let Err(ended) = self.finishers.push(task) {
             self.fail_frame(frame, &ended.to_string());
         }
+    }
+
+    /// Closes the link of a worker that drew false pixels, and shuts it out.
+    fn shut_out(&mut self, id: WorkerId, identity: WorkerIdentity, frame: FrameId, tile: Rect) {
+        let who = self.workers.who(id);
+        let (worker, address) = who.map_or_else(
+            || (identity.name.clone(), String::new()),
+            |who| (who.name.to_string(), who.address.to_string()),
+        );
+        let (job, number) = self.flights.get(&frame).map(|f| (f.job, f.number)).unzip();
+        let shown = identity.to_string();
+        let shut_out = self.workers.shut_out(id, identity);
+        warn!(
+            worker,
+            identity = shown,
+            address,
+            job = job.map(tracing::field::display),
+            frame = number,
+            tile = format!("{},{}", tile.x0, tile.y0),
+            shut_out_secs = shut_out.as_secs(),
+            "worker drew other pixels than others did: it is shut out, and frames with its tiles are \
+             drawn again"
+        );
+        self.refresh_states();
     }
 
     /// Fails a frame of which no worker could draw a tile; its job goes on with the others.

@@ -415,6 +415,13 @@ impl Table {
         is_over
     }
 
+    /// Notes that a frame that was being drawn is to be drawn again.
+    pub(crate) fn draw_again(&mut self, id: JobId, number: u64) {
+        if let Some(job) = self.jobs.get_mut(&id) {
+            job.retried.insert(number);
+        }
+    }
+
     /// Why a frame failed, if it did.
     fn failure(&self, id: JobId, number: u64) -> Option<Arc<str>> {
         self.jobs.get(&id)?.failed.get(&number).cloned()

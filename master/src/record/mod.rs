@@ -88,6 +88,9 @@ struct Head {
     lease: u64,
     poison_after: u32,
     queue_ahead: u32,
+    /// Audits: share in millionths, how many tiles of a new worker, and the seed.
+    #[serde(default)]
+    audits: (u32, u32, u64),
 }
 
 /// An event without its pixels.
@@ -121,6 +124,9 @@ struct NotedWorker {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     who: Option<(String, String)>,
     threads: u32,
+    /// Whether its pixels are not believed without audits.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    audited: bool,
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     here: bool,
     memory: u64,
@@ -163,6 +169,9 @@ struct NotedResult {
     /// For each source of error: pixels sampled, and the sum of their squared errors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     sampled: Option<Box<[(u32, u64); 4]>>,
+    /// A number that differs where pixels do, so that replayed audits compare alike.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    mark: u32,
     /// Bytes of its message.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     bytes: Option<u32>,
@@ -183,6 +192,28 @@ struct NotedPiece {
     /// Lengths of its planes in pixels, as in [`NotedResult::planes`].
     planes: (usize, usize, Option<usize>),
     finite: bool,
+}
+
+fn is_zero(n: &u32) -> bool {
+    *n == 0
+}
+
+/// Returns a number below 2^23 that differs where pixels do, but for one case in millions.
+fn mark(pixels: &Pixels) -> u32 {
+    let word = |x: u32| x.to_le_bytes();
+    let hash = match pixels {
+        Pixels::Sums(p) => {
+            let a = p.a.iter().flat_map(|a| word(a.to_bits()));
+            let colour = p.colour.iter().flatten().flat_map(|c| word(*c));
+            let last = p.last.iter().flatten().flatten().flat_map(|c| word(*c));
+            hash(a.chain(colour).chain(last))
+        }
+        Pixels::Finished(tile) => {
+            let most = word(tile.max_alpha.to_bits());
+            hash(tile.mask.iter().chain(&tile.data).copied().chain(most))
+        }
+    };
+    (hash ^ (hash >> 32)) as u32 & 0x7f_ffff
 }
 
 impl NotedPiece {
@@ -235,6 +266,7 @@ impl NotedResult {
                 .as_ref()
                 .filter(|r| r.sampled != ErrorsBySource::default())
                 .map(|r| Box::new(r.sampled.to_array().map(|s| (s.pixels, s.squares)))),
+            mark: mark(&result.pixels),
             bytes: result.bytes,
             finished,
         }
@@ -253,6 +285,8 @@ enum Decision {
     Done { frame: u64, stats: Box<FrameStats> },
     Failed { frame: u64, reason: String },
     Paused { worker: u64, pause_us: u64 },
+    ShutOut { worker: u64, frame: u64 },
+    Tainted { frame: u64 },
 }
 
 #[derive(Debug)]
@@ -314,6 +348,10 @@ impl Decision {
             Action::FrameFailed { frame, reason, .. } => {
                 Decision::Failed { frame: frame.0, reason: reason.clone() }
             }
+            Action::ShutOut { worker, frame, .. } => {
+                Decision::ShutOut { worker: worker.0, frame: frame.0 }
+            }
+            Action::FrameTainted { frame } => Decision::Tainted { frame: frame.0 },
             Action::Paused { worker, pause_us, .. } => {
                 Decision::Paused { worker: worker.0, pause_us: *pause_us }
             }
@@ -393,6 +431,8 @@ impl fmt::Display for Decision {
                 write!(f, "f{frame}: done in {ms} ms, statistics {hash:016x}")
             }
             Decision::Failed { frame, reason } => write!(f, "f{frame}: failed, {reason}"),
+            Decision::ShutOut { worker, frame } => write!(f, "w{worker}: shut out by f{frame}"),
+            Decision::Tainted { frame } => write!(f, "f{frame}: has tiles of a liar"),
             Decision::Paused { worker, pause_us } => write!(f, "w{worker}: pauses {pause_us} us"),
         }
     }
@@ -480,6 +520,7 @@ fn noted(event: &Event, is_shut: impl Fn(&TileResult, f32) -> bool) -> Option<No
             name,
             identity,
             threads,
+            is_trusted,
             is_local,
             memory_budget_bytes,
             held,
@@ -488,6 +529,7 @@ fn noted(event: &Event, is_shut: impl Fn(&TileResult, f32) -> bool) -> Option<No
             name: name.clone(),
             who: Some((identity.host.clone(), identity.name.clone())),
             threads: *threads,
+            audited: !*is_trusted,
             here: *is_local,
             memory: *memory_budget_bytes,
             held: held

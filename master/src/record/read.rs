@@ -280,7 +280,19 @@ fn config(head: &Head) -> Result<Config, String> {
     {
         return Err("has settings that no master has".into());
     }
-    Ok(Config { heartbeat, silence, hush, lease, poison_after, queue_ahead, mixed: false })
+    let (audit_ppm, audit_first, audit_seed) = head.audits;
+    Ok(Config {
+        heartbeat,
+        silence,
+        hush,
+        lease,
+        poison_after,
+        audit_ppm,
+        audit_first,
+        audit_seed,
+        queue_ahead,
+        mixed: false,
+    })
 }
 
 fn key(text: &str) -> Result<BrickSetKey, String> {
@@ -336,7 +348,7 @@ fn recorded_clock(t: Vec<u64>, seen: &mut Seen) -> Result<RecordedClock, String>
 fn event(e: Noted, seen: &mut Seen) -> Result<Event, String> {
     let ids = |ids: Vec<u32>| ids.into_iter().map(BrickId).collect::<Vec<_>>();
     Ok(match e {
-        Noted::Joined(NotedWorker { w, name, who, threads, here, memory, held }) => {
+        Noted::Joined(NotedWorker { w, name, who, threads, audited, here, memory, held }) => {
             if !seen.workers.insert(w) {
                 return Err(format!("w{w} joined before; a worker's name is never used again"));
             }
@@ -353,6 +365,7 @@ fn event(e: Noted, seen: &mut Seen) -> Result<Event, String> {
                 name,
                 identity,
                 threads,
+                is_trusted: !audited,
                 is_local,
                 memory_budget_bytes,
                 held,
@@ -416,6 +429,7 @@ fn finished(r: &NotedResult) -> Result<Option<SparseTile>, String> {
         return Err("its leaves are none, or more than the wire lets through".into());
     }
     let mut leaves = SparseTile::blank(size, format);
+    leaves.max_alpha = r.mark as f32 / (1 << 23) as f32;
     if !fits {
         leaves.data.push(0);
     }
@@ -462,6 +476,9 @@ fn result(r: &NotedResult) -> Result<TileResult, String> {
     };
     if !r.finite {
         *pixels.a.first_mut().ok_or("`finite` of a plane without pixels")? = f32::NAN;
+    }
+    if let Some(first) = pixels.colour.first_mut() {
+        first[0] = r.mark;
     }
     let sampled = r
         .sampled

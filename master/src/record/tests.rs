@@ -140,6 +140,7 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, RecordSummary) {
                 let (is_local, memory_budget_bytes) = (rng.below(2) == 0, budget);
                 Some(Event::WorkerJoined {
                     worker,
+                    is_trusted: next % 4 != 0,
                     identity: WorkerIdentity { host: "here".into(), name: name.clone() },
                     name,
                     threads,
@@ -272,8 +273,12 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, RecordSummary) {
                     let clock_us = clock.0.get() + 77;
                     arrived.push(Event::Pong { worker, nonce, clock_us });
                 }
-                Action::Drop { worker, .. } => workers.retain(|w| *w != worker),
-                Action::FrameDone { .. } | Action::FrameFailed { .. } => over += 1,
+                Action::Drop { worker, .. } | Action::ShutOut { worker, .. } => {
+                    workers.retain(|w| *w != worker);
+                }
+                Action::FrameDone { .. }
+                | Action::FrameFailed { .. }
+                | Action::FrameTainted { .. } => over += 1,
                 _ => {}
             }
         }
@@ -292,8 +297,8 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, RecordSummary) {
 #[test]
 fn recorded_runs_replay_identically() {
     let (mut frames, mut dropped, mut dropped_finished) = (0, 0, [0; 3]);
-    let mut pieces = 0;
-    for seed in 0..72 {
+    let (mut pieces, mut shut_out) = (0, 0);
+    for seed in 0..96 {
         let schedule = if seed % 2 == 0 { Schedule::Slab } else { Schedule::Region };
         let (bytes, written) = recorded(seed, schedule);
         let done = replay(&bytes[..]).unwrap_or_else(|e| panic!("seed {seed}: {e}"));
@@ -303,16 +308,17 @@ fn recorded_runs_replay_identically() {
         frames += done.frames;
         let text = String::from_utf8_lossy(&bytes);
         dropped += text.matches("plane has").count();
+        shut_out += text.matches(": shut out by").count();
         pieces += text.matches(", as it was left").count();
         let lies = ["do not fit", "its tile has", "a result in Rgba8"];
         for (n, lie) in dropped_finished.iter_mut().zip(lies) {
             *n += text.matches(lie).count();
         }
     }
-    let all = dropped > 0 && pieces > 0 && dropped_finished.iter().all(|n| *n > 0);
+    let all = dropped > 0 && pieces > 0 && shut_out > 0 && dropped_finished.iter().all(|n| *n > 0);
     assert!(
         frames > 120 && all,
-        "{frames} frames, {dropped} and {dropped_finished:?} liars, {pieces} pieces"
+        "{frames} frames, {dropped} and {dropped_finished:?} liars, {pieces} pieces, {shut_out} shut out"
     );
 }
 

@@ -130,7 +130,8 @@ fn write(mut out: impl Write, entries: &Receiver<Entry>) -> std::io::Result<Reco
 
 /// Returns the first line of a record.
 fn head(config: &Config) -> Head {
-    let &Config { heartbeat, silence, hush, lease, poison_after, queue_ahead, mixed: _ } = config;
+    let &Config { heartbeat, silence, hush, lease, poison_after, queue_ahead, .. } = config;
+    let audits = (config.audit_ppm, config.audit_first, config.audit_seed);
     Head {
         version: VERSION,
         program: env!("CARGO_PKG_VERSION").into(),
@@ -142,6 +143,7 @@ fn head(config: &Config) -> Head {
         lease,
         poison_after,
         queue_ahead,
+        audits,
     }
 }
 

@@ -73,6 +73,14 @@ impl FrameCore {
         now: Micros,
     ) {
         cluster.roster.add_lease(id, now, &cluster.config);
+        // Pieces go on from what another worker drew, and are not compared.
+        let task = &self.table.queue.tasks[place as usize];
+        if !task.is_audited() && task.begun.is_none() && !is_copy {
+            let id_of_task = self.table.queue.id(place).0;
+            if cluster.audits(id, id_of_task) {
+                self.table.queue.audit(place);
+            }
+        }
         if !bricks.is_empty() {
             cluster.residency.pin(id, &bricks);
             cluster.residency.want(id, bricks.iter().copied());
@@ -448,7 +456,7 @@ impl RegionFrame {
     }
 }
 
-/// Whether a worker may try a task that workers failed at: the likeliest do. These are workers that
+/// Whether a worker may try a task that workers failed at or that is audited: the likeliest do. These are workers that
 /// have not failed at it, and of them those that have drawn something before, since anybody may call
 /// himself a new worker.
 fn may_try(cluster: &Cluster, task: &Task, id: WorkerId) -> bool {
@@ -456,6 +464,15 @@ fn may_try(cluster: &Cluster, task: &Task, id: WorkerId) -> bool {
         true => 0,
         false => 1 + u32::from(w.reputation.has_drawn),
     };
+    if let (Some(audit), Some(w)) = (task.audit(), cluster.roster.get(id)) {
+        // Who has voted has no other vote, nor has its neighbour if one from elsewhere is there.
+        let may = |w: &Worker| !audit.has_vote_of(&w.identity);
+        let is_far = |w: &Worker| w.is_trusted || audit.is_elsewhere(&w.identity);
+        let waits = || cluster.roster.active().any(|(_, other)| may(other) && is_far(other));
+        if !may(w) || !is_far(w) && waits() {
+            return false;
+        }
+    }
     let mine = cluster.roster.get(id).map_or(0, rank);
     !task.is_choosy() || cluster.roster.active().all(|(_, w)| rank(w) <= mine)
 }

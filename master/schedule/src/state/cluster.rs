@@ -3,9 +3,10 @@
 use crate::policy::active_set::ActiveSet;
 use crate::policy::cost_history::CostHistory;
 use crate::policy::link_use::LinkUse;
+use crate::state::audits::{Lie, is_in_share};
 use crate::state::reputation::Reputations;
 use crate::state::residency::Residency;
-use crate::state::workers::Roster;
+use crate::state::workers::{Roster, Worker};
 use crate::{Action, Config, Micros, Totals};
 use slabcast_common::ids::WorkerId;
 use slabcast_common::message::ToWorker;
@@ -17,6 +18,8 @@ pub(crate) struct Cluster {
     pub(crate) config: Config,
     pub(crate) roster: Roster,
     pub(crate) reputations: Reputations,
+    /// Workers that the last result showed to be liars.
+    pub(crate) lies: Vec<Lie>,
     pub(crate) residency: Residency,
     pub(crate) history: CostHistory,
     pub(crate) link_use: LinkUse,
@@ -45,6 +48,17 @@ impl Cluster {
     pub(crate) fn activate_all(&mut self) {
         self.active_set.activate_all();
         self.roster.activate(usize::MAX);
+    }
+
+    /// Whether a task that a worker is lent is to be audited: the worker is not trusted, and there
+    /// is another to compare with.
+    pub(crate) fn audits(&self, id: WorkerId, task: u64) -> bool {
+        let Some(worker) = self.roster.get(id).filter(|w| !w.is_trusted) else { return false };
+        let Config { audit_ppm, audit_first, audit_seed, .. } = self.config;
+        let is_chosen =
+            worker.reputation.agreed < audit_first || is_in_share(audit_seed, task, audit_ppm);
+        let is_other = |w: &Worker| !w.leaving && w.identity != worker.identity;
+        is_chosen && self.roster.iter().any(|(_, w)| is_other(w))
     }
 
     /// Counts a failure of a worker.

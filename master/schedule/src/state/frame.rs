@@ -20,6 +20,7 @@ use crate::account::ledger::{Ledger, Rendered, ms, place_in_time};
 use crate::account::spans;
 use crate::dispatch::speculate::Pace;
 use crate::policy::macrotile::Cut;
+use crate::state::audits::{Drawn, Lie, Verdict as AuditEnd};
 use crate::state::cluster::Cluster;
 use crate::state::given_up::GivenUp;
 use crate::state::leases::{LeaseTable, Lent};
@@ -28,6 +29,7 @@ use crate::state::residency::{ResidencyAction, Transfer};
 use crate::state::result_checks::{check_cost, check_leaves, check_sums};
 use crate::state::slab_frame::SlabFrame;
 use crate::state::task_queue::{End, Task, Verdict};
+use crate::state::worker_map::WorkerMap;
 use crate::state::workers::Worker;
 use crate::{Action, Clock, FrameJob, Micros, Span};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
@@ -108,6 +110,8 @@ pub(crate) struct FrameCore {
     relevant_voxels: u64,
     /// The first tile that was given up.
     given_up: Option<Box<GivenUp>>,
+    /// When each worker that is not trusted drew a tile last that nobody compared.
+    unaudited: WorkerMap<Micros>,
     pub(crate) ledger: Ledger,
 }
 
@@ -174,6 +178,7 @@ impl FrameCore {
             brick_use: BrickUse::new(job.bricks.len()),
             relevant_voxels: cluster.residency.voxels(job.scene.bricks),
             given_up: None,
+            unaudited: WorkerMap::default(),
             ledger,
             job,
         }
@@ -266,6 +271,11 @@ impl FrameCore {
         }
         cluster.roster.end_leases(worker, 1);
         Some(lent)
+    }
+
+    /// Returns when a worker drew a tile last that nobody compared.
+    pub(crate) fn unaudited(&self, id: WorkerId) -> Option<Micros> {
+        self.unaudited.get(id).copied()
     }
 
     /// Returns the number of leases of a worker.
@@ -408,7 +418,6 @@ impl Frame {
         clock: &dyn Clock,
     ) -> Result<Option<(Micros, Micros)>, String> {
         let now = clock.now();
-        let slab = self.slab().0;
         let by_region = self.as_region().is_some();
         let core = self.core_mut();
         let before = core.table.note_answer(worker, now);
@@ -439,11 +448,66 @@ impl Frame {
         }
         let rendered = place_in_time(who, &result.times, lease.sent, now);
         let Rendered { start, end, .. } = rendered;
-        let (name, thread) = (who.name.clone(), result.times.thread.min(who.threads - 1));
-        let edge = core.table.cut.edge_of(&tile);
         let est = core.table.cut.tiles[place as usize].est;
         let lasted = now.saturating_sub(lease.sent.max(before));
         core.pace.note(est, end - start, lasted);
+        let drawn = Drawn {
+            worker,
+            who: who.identity.clone(),
+            is_trusted: who.is_trusted,
+            name: who.name.clone(),
+            thread: result.times.thread.min(who.threads - 1),
+            epoch: result.epoch,
+            rendered,
+            bricks_used: lent.map_or(0, |l| l.bricks.len()),
+            result: Box::new(result),
+        };
+        let is_audited = core.table.queue.tasks[place as usize].is_audited();
+        let Some(AuditEnd { truth, agreed, liars }) = core.table.queue.vote(place, drawn, now)
+        else {
+            self.find_second(cluster, place);
+            return Ok(None);
+        };
+        for id in agreed {
+            if let Some(worker) = cluster.roster.get_mut(id) {
+                worker.reputation.agree(now);
+            }
+        }
+        let frame = core.job.frame;
+        let lies = liars.into_iter().map(|(worker, who)| Lie { worker, who, frame, tile });
+        cluster.lies.extend(lies);
+        if !is_audited && !truth.is_trusted {
+            core.unaudited.insert(worker, now);
+        }
+        self.enter(cluster, place, truth, clock);
+        Ok(Some((start, end)))
+    }
+
+    /// Has another worker draw a task whose result waits to be compared: a trusted one, or the one
+    /// with least to do.
+    fn find_second(&mut self, cluster: &Cluster, place: u32) {
+        let Some(region) = self.as_region_mut() else { return };
+        let Some(audit) = region.core.table.queue.tasks[place as usize].audit() else { return };
+        let others = cluster.roster.active().filter(|(_, w)| !audit.has_vote_of(&w.identity));
+        let key = |w: &Worker| (!w.is_trusted, !audit.is_elsewhere(&w.identity), w.leases);
+        let second = others.min_by_key(|(_, w)| key(w)).map(|(id, _)| id);
+        if let Some(id) = second {
+            region.tiles.give(place, id);
+        }
+    }
+
+    /// Enters the result of a task: its pixels, and its costs.
+    fn enter(&mut self, cluster: &mut Cluster, place: u32, drawn: Drawn, clock: &dyn Clock) {
+        let now = clock.now();
+        let (slab, _) = self.slab();
+        let by_region = self.as_region().is_some();
+        let Drawn { worker, name, thread, epoch, rendered, mut bricks_used, result, .. } = drawn;
+        let Rendered { start, end, .. } = rendered;
+        let core = self.core_mut();
+        let tile = core.table.tile(place);
+        let cost = result.region.as_ref().filter(|_| by_region);
+        let edge = core.table.cut.edge_of(&tile);
+        let est = core.table.cut.tiles[place as usize].est;
         core.ledger.add_result_bytes(result.bytes);
         core.ledger.add_rendering(worker, &rendered, &result.counters);
         core.rendered.push(RenderedTile {
@@ -455,7 +519,6 @@ impl Frame {
             end,
             arrived: now,
         });
-        let mut bricks_used = lent.map_or(0, |l| l.bricks.len());
         if let Some(cost) = cost {
             bricks_used = cost.touched.len();
             for &i in &cost.touched {
@@ -473,19 +536,19 @@ impl Frame {
             edge,
             est,
             bricks: bricks_used,
-            attempt: result.epoch.0,
+            attempt: epoch.0,
         });
+        let TileResult { pixels, region, .. } = *result;
         match self {
-            Frame::Slab(frame) => frame.rendered(tile, result.pixels, (worker, thread), end),
+            Frame::Slab(frame) => frame.rendered(tile, pixels, (worker, thread), end),
             Frame::Region(frame) => {
-                frame.rendered(cluster, place, worker, end - start, result.pixels, result.region);
+                frame.rendered(cluster, place, worker, end - start, pixels, region);
             }
         }
         let core = self.core_mut();
         core.ledger.composite_us += clock.now().saturating_sub(now);
         core.table.queue.finish(place, End::Done { worker: name, render_us: end - start });
         self.report_progress(cluster);
-        Ok(Some((start, end)))
     }
 
     /// Queues a progress report.
@@ -618,7 +681,8 @@ impl Frame {
 
     /// Requeues tasks whose leases expired or whose pause is over, and gives up those that no
     /// linked worker can draw.
-    pub(crate) fn tick(&mut self, cluster: &mut Cluster, now: Micros) {
+    pub(crate) fn tick(&mut self, cluster: &mut Cluster, clock: &dyn Clock) {
+        let now = clock.now();
         let (slab, _) = self.slab();
         let core = self.core_mut();
         let queue = &mut core.table.queue;
@@ -627,6 +691,23 @@ impl Frame {
         if core.stage != Stage::Drawing {
             return;
         }
+        let held: Vec<u32> = core.table.queue.held().collect();
+        for place in held {
+            let core = self.core_mut();
+            let Some(audit) = core.table.queue.tasks[place as usize].audit() else { continue };
+            let may = |w: &Worker| !w.leaving && !audit.has_vote_of(&w.identity);
+            if cluster.roster.iter().any(|(_, w)| may(w)) {
+                continue;
+            }
+            if let Some(names) = audit.undecided(now) {
+                let given_up = GivenUp::undecided(&core.table, place, slab, names);
+                core.given_up.get_or_insert(Box::new(given_up));
+            } else if let Some(drawn) = core.table.queue.take_sole_vote(place) {
+                core.unaudited.insert(drawn.worker, now);
+                self.enter(cluster, place, drawn, clock);
+            }
+        }
+        let core = self.core_mut();
         let troubled: Vec<u32> = core.table.queue.troubled().collect();
         for place in troubled {
             let is_hopeless = {

@@ -16,6 +16,24 @@ pub(crate) struct GivenUp {
 }
 
 impl GivenUp {
+    /// Tells of the task at an index, of a slab, that workers drew differently.
+    pub(crate) fn undecided(
+        table: &LeaseTable,
+        place: u32,
+        slab: usize,
+        names: Vec<String>,
+    ) -> GivenUp {
+        let rect = table.tile(place);
+        let (size, x, y) = (table.cut.edge_of(&rect), rect.x0 as u32, rect.y0 as u32);
+        let workers: Vec<String> = names.iter().map(|n| printable(n)).collect();
+        let reason = format!(
+            "{} drew different pixels of the tile of {size} pixels at {x},{y}, and no other worker is \
+             there to say who is right; start one, best on the master's machine",
+            workers.join(" and ")
+        );
+        GivenUp { tile: PoisonedTile { slab: slab as u32, x, y, size, workers }, reason }
+    }
+
     /// Tells of the task at an index, of a slab.
     pub(crate) fn new(table: &LeaseTable, place: u32, slab: usize) -> GivenUp {
         let task = &table.queue.tasks[place as usize];

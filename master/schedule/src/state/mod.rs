@@ -1,6 +1,7 @@
 //! State of the scheduler: frames in the making, leases, workers, and which worker holds which
 //! brick.
 
+pub(crate) mod audits;
 pub(crate) mod cluster;
 pub(crate) mod frame;
 pub(crate) mod given_up;

@@ -26,6 +26,9 @@ pub(crate) struct Reputation {
     pub(crate) strikes: u32,
     /// Whether any result of it was accepted.
     pub(crate) has_drawn: bool,
+    /// Audits in which it drew what others drew, and the time of the last.
+    pub(crate) agreed: u32,
+    pub(crate) agreed_at: Micros,
     seen: Micros,
 }
 
@@ -39,6 +42,13 @@ impl Reputation {
     pub(crate) fn add_result(&mut self) {
         self.strikes = self.strikes.saturating_sub(1);
         self.has_drawn = true;
+    }
+
+    /// Counts an audit in which it drew what others drew.
+    pub(crate) fn agree(&mut self, now: Micros) {
+        self.agreed = self.agreed.saturating_add(1);
+        self.agreed_at = now;
+        self.add_result();
     }
 
     /// Returns for how many microseconds the worker is lent nothing after a failure.

@@ -19,6 +19,7 @@
 //! ([`TaskQueue::hopeless`]).
 
 use crate::policy::macrotile::Macrotile;
+use crate::state::audits::{Audit, Drawn, Verdict as AuditEnd};
 use crate::{Config, Micros, WorkerIdentity};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
 use slabcast_common::message::Checkpoint;
@@ -78,6 +79,8 @@ pub(crate) struct Task {
     blamed: u32,
     /// While it waits after a failure: until when only the likeliest workers may try it.
     choosy_until: Option<Micros>,
+    /// Results that wait to be compared; `None`: the first one counts.
+    audit: Option<Audit>,
     /// State in which another worker gave the piece away; `None`: it starts from nothing.
     pub(crate) begun: Option<Arc<Checkpoint>>,
 }
@@ -93,6 +96,7 @@ impl Task {
             failures: Vec::new(),
             blamed: 0,
             choosy_until: None,
+            audit: None,
             begun: None,
         }
     }
@@ -109,6 +113,15 @@ impl Task {
 
     fn is_suspect(&self) -> bool {
         self.blamed > 0
+    }
+
+    /// Whether two workers draw it.
+    pub(crate) fn is_audited(&self) -> bool {
+        self.audit.is_some()
+    }
+
+    pub(crate) fn audit(&self) -> Option<&Audit> {
+        self.audit.as_ref()
     }
 
     /// How often a worker failed at it.
@@ -160,6 +173,8 @@ pub(crate) struct TaskQueue {
     paused: BTreeSet<(Micros, u32)>,
     /// Open tasks that workers failed at.
     troubled: BTreeSet<u32>,
+    /// Open tasks with results that wait to be compared.
+    held: BTreeSet<u32>,
     open: u32,
     /// Leases beyond the first of a task.
     pub(crate) retries: u64,
@@ -178,6 +193,7 @@ impl TaskQueue {
             open: tiles.len() as u32,
             paused: BTreeSet::new(),
             troubled: BTreeSet::new(),
+            held: BTreeSet::new(),
             retries: 0,
         }
     }
@@ -208,7 +224,9 @@ impl TaskQueue {
     /// tasks that were refused or lost a worker.
     pub(crate) fn is_only_lease(&self, place: u32, worker: WorkerId, epoch: Epoch) -> bool {
         let task = &self.tasks[place as usize];
-        task.may_speculate() && task.leases.iter().all(|l| l.worker == worker && l.epoch == epoch)
+        task.may_speculate()
+            && !task.is_audited()
+            && task.leases.iter().all(|l| l.worker == worker && l.epoch == epoch)
     }
 
     /// Ends a lease without a result, through no fault of its worker.
@@ -275,7 +293,8 @@ impl TaskQueue {
             let has_suspect = mine.iter().any(|&p| self.tasks[p as usize].is_suspect());
             let has_it = mine.contains(&place);
             let two_suspects = has_suspect && task.is_suspect();
-            !(has_it || two_suspects) && (task.failures.is_empty() || may_try(task))
+            let is_plain = task.failures.is_empty() && task.audit.is_none();
+            !(has_it || two_suspects) && (is_plain || may_try(task))
         }
     }
 
@@ -355,6 +374,7 @@ impl TaskQueue {
         if let Some(order) = task.queued.take() {
             self.waiting.remove(&order);
         }
+        self.held.remove(&place);
         if self.troubled.remove(&place) {
             self.paused.retain(|(_, paused)| *paused != place);
         }
@@ -459,6 +479,39 @@ impl TaskQueue {
         }
     }
 
+    /// Has a task audited.
+    pub(crate) fn audit(&mut self, place: u32) {
+        self.tasks[place as usize].audit = Some(Audit::default());
+    }
+
+    /// Takes a result of a task. One that is not audited, or whose audit it ends, is done with the
+    /// verdict; else it waits for another worker.
+    pub(crate) fn vote(&mut self, place: u32, drawn: Drawn, now: Micros) -> Option<AuditEnd> {
+        let task = &mut self.tasks[place as usize];
+        let Some(audit) = &mut task.audit else {
+            let (agreed, liars) = (Vec::new(), Vec::new());
+            return Some(AuditEnd { truth: drawn, agreed, liars });
+        };
+        let (worker, epoch) = (drawn.worker, drawn.epoch);
+        let end = audit.add(drawn, now);
+        if end.is_none() {
+            self.held.insert(place);
+            self.release(place, worker, epoch);
+        }
+        end
+    }
+
+    /// Returns the open tasks whose results wait to be compared and that nobody has now.
+    pub(crate) fn held(&self) -> impl Iterator<Item = u32> {
+        let is_free = |place: &u32| self.tasks[*place as usize].leases.is_empty();
+        self.held.iter().copied().filter(is_free)
+    }
+
+    /// Takes the only result of a task that nobody can compare.
+    pub(crate) fn take_sole_vote(&mut self, place: u32) -> Option<Drawn> {
+        self.tasks[place as usize].audit.as_mut()?.take_sole()
+    }
+
     /// Returns the open tasks that workers failed at and nobody has now.
     pub(crate) fn troubled(&self) -> impl Iterator<Item = u32> {
         let is_free = |place: &u32| self.tasks[*place as usize].leases.is_empty();
@@ -530,8 +583,9 @@ impl TaskQueue {
     /// Returns the next time at which a lease ends, a pause is over or any worker may try a task.
     pub(crate) fn next_deadline(&self) -> Option<Micros> {
         let choosy = self.troubled.iter().filter_map(|p| self.tasks[*p as usize].choosy_until);
+        let held = self.held.iter().filter_map(|p| self.tasks[*p as usize].audit()?.deadline());
         let first = [self.deadlines.first().map(|d| d.0), self.paused.first().map(|p| p.0)];
-        first.into_iter().flatten().chain(choosy).min()
+        first.into_iter().flatten().chain(choosy).chain(held).min()
     }
 }
 

@@ -49,6 +49,7 @@ pub(crate) struct Newcomer {
     pub(crate) reputation: Reputation,
     pub(crate) threads: u32,
     pub(crate) is_local: bool,
+    pub(crate) is_trusted: bool,
 }
 
 /// One worker.
@@ -61,6 +62,8 @@ pub(crate) struct Worker {
     pub(crate) threads: u32,
     /// Whether the worker runs on the master's host.
     pub(crate) is_local: bool,
+    /// Whether its pixels are believed without audits.
+    pub(crate) is_trusted: bool,
     pub(crate) since: Micros,
     /// The worker drains and takes no more leases.
     pub(crate) leaving: bool,
@@ -207,13 +210,14 @@ impl Roster {
     }
 
     pub(crate) fn join(&mut self, id: WorkerId, newcomer: Newcomer, now: Micros) {
-        let Newcomer { name, identity, reputation, threads, is_local } = newcomer;
+        let Newcomer { name, identity, reputation, threads, is_local, is_trusted } = newcomer;
         let worker = Worker {
             name: name.into(),
             identity,
             reputation,
             threads: threads.clamp(1, MAX_THREADS),
             is_local,
+            is_trusted,
             since: now,
             leaving: false,
             is_spare: false,

@@ -273,6 +273,12 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             Action::Drop { worker, .. } => {
                 self.dropped.insert(worker);
             }
+            Action::ShutOut { worker, .. } => {
+                self.dropped.insert(worker);
+            }
+            Action::FrameTainted { .. } => {
+                self.frames_in_hand = self.frames_in_hand.saturating_sub(1);
+            }
             Action::Progress { .. } | Action::Paused { .. } => {}
         }
     }

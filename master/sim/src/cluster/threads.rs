@@ -8,7 +8,7 @@ use crate::cluster::links::state_bytes;
 use crate::model::{Region, TaskOutput, TileModel};
 use crate::outcome::Observer;
 use slabcast_common::ids::{BrickId, Epoch, TaskId, WorkerId};
-use slabcast_common::message::{RegionCost, RegionSplit, TaskTimes, TileResult};
+use slabcast_common::message::{Pixels, RegionCost, RegionSplit, TaskTimes, TileResult};
 use slabcast_common::region::{PART_EDGE, parts};
 use slabcast_schedule::Event;
 use std::collections::BTreeSet;
@@ -282,6 +282,12 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             Task::Region(lease, region) => self.model.finish_region(&job, &lease, region),
         };
         self.lie(&mut output, &job, faults.lie_one_in);
+        if faults.false_one_in > 0 && self.rng.one_in(faults.false_one_in) {
+            match &mut output.pixels {
+                Pixels::Sums(sums) => sums.colour[0][1] ^= 0x155,
+                Pixels::Finished(tile) => tile.max_alpha += 0.25,
+            }
+        }
         let TaskOutput { pixels, counters, touched } = output;
         // Bytes on the wire, and how many were packed into them.
         let facts = &loan.facts;

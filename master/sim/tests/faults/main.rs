@@ -3,6 +3,7 @@
 //!
 //! Campaigns draw whole clusters and their incidents from seeds; [`stories`] change one thing each.
 
+mod lies;
 mod pattern;
 mod silent;
 mod statistics;
@@ -40,6 +41,7 @@ fn random_worker(rng: &mut Rng, small_budgets: bool) -> WorkerProfile {
         latency_ns: [50_000, slowest_ns],
         brick_bytes_per_s: rng.pick(&[None, Some(4e7), Some(2.5e6), Some(2.5e5)]),
         clock_ahead_us: rng.below(1 << 40),
+        is_trusted: rng.one_in(2),
         faults: Faults {
             duplicate_one_in: rarely(rng, 8),
             lie_one_in: rarely(rng, 60),

@@ -28,6 +28,7 @@ fn statistics_of_a_frame_worked_out_by_hand() {
         worker,
         name,
         identity: WorkerIdentity::default(),
+        is_trusted: true,
         threads: 1,
         is_local: false,
         memory_budget_bytes: u64::MAX,

@@ -1,11 +1,13 @@
 #!/usr/bin/env bash
-# The long campaigns, for nights: bash tests/nightly.sh [mutants|simd|faults|matrix|flips|long]...
+# The long campaigns, for nights: bash tests/nightly.sh [mutants|simd|faults|matrix|flips|soak|long]...
 #
 #   mutants   100,000 mutants of small files through every parser (SLABCAST_MUTANTS)
 #   simd      the renderer's tests on every instruction set of this machine, and its benches once
 #   faults    10,000 seeds of faults in the virtual cluster (SLABCAST_SEEDS)
 #   matrix    every combination of workers, threads, tiles, slabs, culling and links
 #   flips     100,000 flipped bits in each direction of a link, and as many of frames (SLABCAST_FLIPS)
+#   soak      an hour of jobs while workers are killed and stopped and clients cancel
+#             (SLABCAST_SOAK_MINUTES)
 #   long      tests of commands that take half a minute and more
 #
 # Prints one line for each campaign: its name, ok or FAILED, seconds, and its figure. What each
@@ -29,7 +31,7 @@ campaign() { # campaign NAME FIGURE COMMAND...: FIGURE is an awk program over th
 # Sums the tests of all test programs.
 tests='/^test result:/ { passed += $4; failed += $6 } END { printf "%d tests passed, %d failed", passed, failed }'
 
-[ $# -gt 0 ] || set -- mutants simd faults matrix flips long
+[ $# -gt 0 ] || set -- mutants simd faults matrix flips soak long
 for name in "$@"; do
     case $name in
     mutants)
@@ -71,12 +73,18 @@ for name in "$@"; do
             env SLABCAST_FLIPS="${SLABCAST_FLIPS:-100000}" \
             cargo test --locked -p slabcast --test noise -- --ignored --nocapture
         ;;
+    soak)
+        campaign soak '/^soak: / { sub("soak: ", ""); print }' \
+            env SLABCAST_SOAK_MINUTES="${SLABCAST_SOAK_MINUTES:-60}" \
+            SLABCAST_SOAK_DIR="$(realpath "$logs")" \
+            cargo test --release --locked -p slabcast --test soak -- --ignored --nocapture
+        ;;
     long)
         campaign long "$tests" \
             cargo test --locked -p slabcast --test commands -- --ignored error_target thin_sheets
         ;;
     *)
-        echo "nightly: no campaign $name; there are mutants, simd, faults, matrix, flips and long" >&2
+        echo "nightly: no campaign $name; there are mutants, simd, faults, matrix, flips, soak and long" >&2
         exit 2
         ;;
     esac

@@ -13,7 +13,12 @@ pub(crate) const SLABCAST: &str = env!("CARGO_BIN_EXE_slabcast");
 
 /// The program in `dir`, without the settings that this machine's user keeps in variables.
 pub(crate) fn slabcast(dir: &Path, args: &[&str]) -> Command {
-    let mut command = Command::new(SLABCAST);
+    command(SLABCAST.as_ref(), dir, args)
+}
+
+/// A build of the program in `dir`, as [`slabcast`].
+pub(crate) fn command(program: &Path, dir: &Path, args: &[&str]) -> Command {
+    let mut command = Command::new(program);
     command.args(args).current_dir(dir).stdin(Stdio::null());
     for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("SLABCAST_")) {
         command.env_remove(name);

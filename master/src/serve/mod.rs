@@ -68,8 +68,9 @@ pub async fn serve(
         .max_frame_size(64 * 1024)
         .max_concurrent_streams(32)
         // Streams that a client opened and reset before they were looked at. With h2's 20 a client
-        // that cancels 64 calls at a time lost its connection every 150 calls, with 128 every 500; at 1024 four floods took 130 MiB;
-        // a flood of resets fills a socket with thousands and still loses it.
+        // that cancels 64 calls at a time lost its connection every 150 calls, with 128 every 500;
+        // at 1024 four floods took 130 MiB. A flood of resets fills a socket with thousands and
+        // still loses it.
         .http2_max_pending_accept_reset_streams(Some(256))
         .http2_max_header_list_size(16 * 1024)
         .http2_keepalive_interval(Some(Duration::from_secs(10)))

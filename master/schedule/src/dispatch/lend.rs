@@ -11,8 +11,9 @@
 //! Then leases leave, each worker's together, with the bricks that their tiles used before.
 
 use crate::Micros;
+use crate::state::brick_orders::send_bricks;
 use crate::state::cluster::Cluster;
-use crate::state::frame::{FrameCore, StepContext, send_bricks};
+use crate::state::frame::{FrameCore, StepContext};
 use crate::state::region_frame::RegionFrame;
 use crate::state::slab_frame::SlabFrame;
 use crate::state::task_queue::Task;

@@ -25,7 +25,7 @@ use crate::state::cluster::Cluster;
 use crate::state::given_up::GivenUp;
 use crate::state::leases::{LeaseTable, Lent};
 use crate::state::region_frame::RegionFrame;
-use crate::state::residency::{ResidencyAction, Transfer};
+use crate::state::residency::Transfer;
 use crate::state::result_checks::{check_cost, check_leaves, check_sums};
 use crate::state::slab_frame::SlabFrame;
 use crate::state::task_queue::{End, Task, Verdict};
@@ -794,65 +794,5 @@ impl Frame {
     }
 }
 
-/// Sends a worker the bricks it is to be sent, and tells it which to drop.
-pub(crate) fn send_bricks(
-    cluster: &mut Cluster,
-    mut ledger: Option<&mut Ledger>,
-    id: WorkerId,
-    now: Micros,
-) {
-    let roster = &mut cluster.roster;
-    let mut is_first = cluster.residency.transfer(id).is_none();
-    let actions = cluster.residency.flush(id, now, &mut || roster.ping(id, now));
-    for action in actions {
-        match action {
-            ResidencyAction::Drop { set, bricks, nonce } => {
-                cluster.send(id, ToWorker::DropBricks { set, bricks });
-                cluster.send(id, ToWorker::Ping { nonce });
-            }
-            ResidencyAction::Send { set, bricks, bytes, over_budget } => {
-                cluster.link_use.bricks_sent(bytes, std::mem::take(&mut is_first), now);
-                if let Some(ledger) = &mut ledger {
-                    ledger.bricks_sent(id, bricks.len() as u64, bytes);
-                }
-                cluster.totals.over_budget += u64::from(over_budget);
-                cluster.out.push_back(Action::SendBricks { worker: id, set, bricks });
-            }
-        }
-    }
-}
-
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::state::workers::Newcomer;
-
-    #[test]
-    fn pixel_is_shut_below_eps_and_not_at_it() {
-        let eps = 1.0 / 512.0;
-        assert!(!is_shut(511.0 / 512.0, eps), "transmittance is eps");
-        assert!(is_shut((511.0f32 / 512.0).next_up(), eps));
-        assert!(!is_shut(1.0, 0.0) && !is_shut(2.0, 0.0), "0 shuts nothing");
-        assert!(!is_shut(f32::NAN, eps));
-    }
-
-    #[test]
-    fn task_times_of_a_wrong_clock_stay_between_lease_and_arrival() {
-        let mut roster = crate::state::workers::Roster::default();
-        let mad = Newcomer { name: "mad".into(), threads: 1, ..Newcomer::default() };
-        roster.join(WorkerId(1), mad, 0);
-        let worker = roster.get(WorkerId(1)).expect("it joined");
-        for (start_us, end_us) in [(0, u64::MAX), (u64::MAX, 0), (5, 6), (7, 7)] {
-            let times = slabcast_common::message::TaskTimes {
-                received_us: u64::MAX / 2,
-                ready_us: 0,
-                start_us,
-                end_us,
-                thread: 9,
-            };
-            let r = place_in_time(worker, &times, 100, 300);
-            assert!(100 <= r.start && r.start <= r.end && r.end <= 300, "{r:?}");
-            assert!(r.p2p_us <= 200);
-        }
-    }
-}
+mod tests;

@@ -2,6 +2,7 @@
 //! brick.
 
 pub(crate) mod audits;
+pub(crate) mod brick_orders;
 pub(crate) mod cluster;
 pub(crate) mod frame;
 pub(crate) mod given_up;

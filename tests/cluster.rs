@@ -35,7 +35,7 @@ fn master() -> (Process, String) {
 }
 
 fn worker(master: &str, name: &str) -> Process {
-    processes::worker(Path::new("."), master, name, &["--threads", "1", "--memory", "16MiB"])
+    processes::worker(Path::new("."), master, name, &["--threads", "1", "--memory", "48MiB"])
 }
 
 fn stats(file: &Path) -> Vec<FrameStats> {

@@ -1,6 +1,7 @@
 //! The bricks that a worker holds, by set, and the directories of sets.
 
 use crate::brick_table::BrickTable;
+use crate::memory;
 use slabcast_common::brick::{Brick, BrickGrid, BrickInfo, BrickSetKey};
 use slabcast_common::ids::BrickId;
 use slabcast_common::message::DIRECTORIES_KEPT;
@@ -18,6 +19,10 @@ pub struct BrickCache {
     sets: BTreeMap<BrickSetKey, BTreeMap<BrickId, Arc<Brick>>>,
     /// Encoded bytes of all bricks.
     encoded: u64,
+    /// Bytes that all bricks take in memory.
+    resident: u64,
+    /// Bytes of memory that they may take; `None` where the worker has no limit of its own.
+    limit: Option<u64>,
     /// Sets whose directories are here, the latest last.
     tables: VecDeque<(BrickSetKey, Arc<BrickTable>)>,
     /// A directory of which more parts are to come.
@@ -32,15 +37,37 @@ struct Coming {
     bricks: Vec<BrickInfo>,
 }
 
+/// Bytes of memory that a brick takes beside its own struct and numbers: the counts of its `Arc`, its
+/// place in the map, and what the allocator adds to four pieces.
+const BESIDE_BYTES: u64 = 16 + 24 + 4 * 16;
+
+fn resident_bytes(brick: &Brick) -> u64 {
+    brick.memory_bytes() as u64 + BESIDE_BYTES
+}
+
 impl BrickCache {
+    /// Returns an empty cache of a worker with `threads` render threads, whose process is to stay
+    /// within `limit_bytes` of memory.
+    pub fn within(limit_bytes: u64, threads: u32) -> BrickCache {
+        let limit = Some(memory::bricks_bytes(limit_bytes, threads));
+        BrickCache { limit, ..BrickCache::default() }
+    }
+
+    /// Returns the encoded bytes of bricks that may be here now; `None` without a limit.
+    pub(crate) fn budget(&self) -> Option<u64> {
+        self.limit.map(|limit| memory::encoded_budget(limit, self.encoded, self.resident))
+    }
+
     /// Adds a brick. A second copy of a brick replaces the first.
     pub fn put(&mut self, set: BrickSetKey, brick: Arc<Brick>) {
         if let Some(table) = self.table(set) {
             table.put(brick.id, Some(brick.clone()));
         }
         self.encoded += brick.encoded_len() as u64;
+        self.resident += resident_bytes(&brick);
         if let Some(before) = self.sets.entry(set).or_default().insert(brick.id, brick) {
             self.encoded -= before.encoded_len() as u64;
+            self.resident -= resident_bytes(&before);
         }
     }
 
@@ -56,6 +83,7 @@ impl BrickCache {
             for id in ids {
                 if let Some(brick) = bricks.remove(id) {
                     self.encoded -= brick.encoded_len() as u64;
+                    self.resident -= resident_bytes(&brick);
                 }
                 if let Some(table) = &table {
                     table.put(*id, None);
@@ -83,8 +111,8 @@ impl BrickCache {
     }
 
     /// Returns the bytes that the bricks take in memory.
-    pub fn bytes(&self) -> usize {
-        self.sets.values().flat_map(BTreeMap::values).map(|b| b.memory_bytes()).sum()
+    pub fn bytes(&self) -> u64 {
+        self.resident
     }
 
     /// Returns the encoded bytes of the bricks, which memory budgets count.
@@ -189,6 +217,18 @@ mod tests {
         assert_eq!(cache.encoded_bytes(), 2 * brick(1).encoded_len() as u64);
         cache.put(key(1), brick(30));
         assert_eq!(cache.encoded_bytes(), 2 * brick(1).encoded_len() as u64, "once");
+        let each = brick(1).memory_bytes() as u64 + BESIDE_BYTES;
+        assert_eq!(cache.bytes(), 2 * each, "in memory, with what stands beside");
+        cache.remove(key(1), &[BrickId(30), BrickId(31), BrickId(77)]);
+        assert_eq!((cache.bytes(), cache.encoded_bytes()), (0, 0));
+    }
+
+    #[test]
+    fn only_a_cache_with_a_limit_has_a_budget() {
+        assert_eq!(BrickCache::default().budget(), None);
+        let cache = BrickCache::within(512 << 20, 2);
+        let budget = cache.budget().expect("a budget");
+        assert!((1 << 20..512 << 20).contains(&budget), "{budget}");
     }
 
     #[test]

@@ -69,6 +69,20 @@ impl std::error::Error for DialError {}
 pub async fn run(
     config: Config,
     master: String,
+    stop: watch::Receiver<bool>,
+) -> Result<Ended, DialError> {
+    run_with(config, BrickCache::default(), master, stop).await
+}
+
+/// Serves a master like [`run`], with a cache of the caller's: one with a limit of memory, or with
+/// bricks.
+///
+/// # Errors
+/// Those of [`run`].
+pub async fn run_with(
+    config: Config,
+    mut cache: BrickCache,
+    master: String,
     mut stop: watch::Receiver<bool>,
 ) -> Result<Ended, DialError> {
     let uri = if master.contains("://") { master.clone() } else { format!("http://{master}") };
@@ -78,7 +92,6 @@ pub async fn run(
         .tcp_nodelay(true)
         .http2_keep_alive_interval(Duration::from_secs(10))
         .keep_alive_timeout(Duration::from_secs(5));
-    let mut cache = BrickCache::default();
     let mut wait = FIRST_WAIT;
     let mut told = false;
     loop {

@@ -40,6 +40,7 @@
 mod brick_table;
 pub mod cache;
 pub mod dial;
+pub mod memory;
 mod pool;
 pub mod rehearse;
 pub mod session;

@@ -568,6 +568,9 @@ impl<'a> Session<'a> {
 
     /// Asks for the bricks that stalled regions lack, after making room.
     fn request_bricks(&mut self) {
+        if let Some(budget) = self.cache.budget() {
+            self.stalls.set_budget(budget);
+        }
         for request in self.stalls.requests(self.cache) {
             let reply = match request {
                 BrickRequest::Forgotten(set, bricks) => {

@@ -86,6 +86,11 @@ impl Stalls {
         }
     }
 
+    /// Sets the encoded bytes of bricks that may be here from now on.
+    pub(crate) fn set_budget(&mut self, budget_bytes: u64) {
+        self.budget_bytes = budget_bytes;
+    }
+
     /// Adds a region, which waits for nothing yet.
     pub(crate) fn add(&mut self, key: RegionKey, set: BrickSetKey, table: Arc<BrickTable>) {
         let (keeps, missing) = Default::default();
@@ -227,6 +232,8 @@ impl Stalls {
             // No regions: the schedule is `slab`, and the master keeps this worker's budget.
             return requests;
         }
+        // Of sets without a directory nothing is drawn, and their bricks go first.
+        self.last_used.retain(|set, _| cache.table(*set).is_some());
         // Bricks that came without being asked for may exceed the budget, too.
         self.make_room(cache, 0, true, &mut requests);
         let oldest = self.regions.keys().next().copied();

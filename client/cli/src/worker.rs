@@ -8,8 +8,9 @@ use slabcast_lab::plan;
 use slabcast_render::Simd;
 use slabcast_session::fail::Fail;
 use slabcast_session::machine::{boot_id, cores};
+use slabcast_session::progress::bytes;
 use slabcast_session::{parse, runtime, signals};
-use slabcast_worker::{Config, Ended, Rehearsal};
+use slabcast_worker::{BrickCache, Config, Ended, Rehearsal, memory};
 use std::path::PathBuf;
 use std::sync::Arc;
 use tokio::sync::watch;
@@ -38,7 +39,7 @@ pub(crate) struct WorkerArgs {
     #[arg(long, value_name = "N",
           value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: Option<u32>,
-    /// Memory for bricks; the process takes some 30 MiB beside them
+    /// Memory for the whole process; bricks get what the rest leaves
     #[arg(long, value_name = "BYTES", default_value = "512MiB",
           value_parser = parse::memory)]
     memory: u64,
@@ -54,11 +55,21 @@ pub(crate) fn run(args: &WorkerArgs) -> Result<(), Fail> {
         Some(file) => Some(Arc::new(Rehearsal::new(plan::read_trace(file)?))),
         None => None,
     };
+    let threads = args.threads.unwrap_or_else(cores);
+    let least = memory::least_bytes(threads);
+    if args.memory < least {
+        return Err(Fail::usage(format!(
+            "--memory: {} is too little to draw with {threads} threads; give at least {}MiB, or \
+             fewer --threads",
+            bytes(args.memory),
+            least.div_ceil(1 << 20),
+        )));
+    }
     let config = Config {
         rehearsal,
         name: args.name.clone().unwrap_or_else(host_and_process),
-        threads: args.threads.unwrap_or_else(cores),
-        memory_budget_bytes: args.memory,
+        threads,
+        memory_budget_bytes: memory::encoded_share(args.memory, threads),
         simd: Simd::detect(),
         machine: boot_id(),
     };
@@ -74,7 +85,8 @@ pub(crate) fn run(args: &WorkerArgs) -> Result<(), Fail> {
             simd = config.simd.name(),
             "worker starts"
         );
-        let dialling = slabcast_worker::dial::run(config, args.master.clone(), stopped);
+        let cache = BrickCache::within(args.memory, config.threads);
+        let dialling = slabcast_worker::dial::run_with(config, cache, args.master.clone(), stopped);
         let mut running = tokio::spawn(dialling);
         systemd::ready(&format!("rendering for {}", args.master));
         let beat = tokio::spawn(systemd::watchdog(None));

@@ -135,7 +135,7 @@ fn a_cluster_frames_as_one_process_does_and_pictures_record_the_numbers() {
     let dir = tempfile::tempdir().unwrap();
     corner(dir.path());
     let (_master, address) = master(dir.path(), CORNER, &[]);
-    let _worker = worker(dir.path(), &address, "w", &["--threads", "1", "--memory", "16MiB"]);
+    let _worker = worker(dir.path(), &address, "w", &["--threads", "1", "--memory", "48MiB"]);
     let look = ["--tf", "peer-opaque", "--azimuth", "30", "--size", "90x70", "-q"];
     good(dir.path(), &[&["render", CORNER, "-o", "here.png"], &look[..]].concat());
     let there = ["render", "--master", &address, "-o", "there.png"];

@@ -417,6 +417,10 @@ fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
         (vec!["master"], &["--volume"]),
         (vec!["worker"], &["--master"]),
         (vec!["worker", "--master", "a:1", "--memory", "1"], &["--memory", "512MiB"]),
+        (
+            vec!["worker", "--master", "a:1", "--memory", "40MiB", "--threads", "2"],
+            &["--memory", "40.0 MiB", "too little", "with 2 threads", "give at least 52MiB"],
+        ),
         (vec!["worker", "--master", "a:1", "--threads", "9999"], &["--threads", "1024"]),
     ]
 }

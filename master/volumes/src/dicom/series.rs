@@ -336,9 +336,11 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
         }
         if most > 1.05 * least {
             notes.push(format!(
-                "the slices of {} are {least:.3} to {most:.3} mm apart, and are drawn as if they \
-                 were even; some may be missing",
-                quoted(&name)
+                "the slices of {} are {} to {} mm apart, and are drawn as if they were even; some \
+                 may be missing",
+                quoted(&name),
+                millimetres(least),
+                millimetres(most)
             ));
         }
         let origin = slices[0].place.expect("all have one").0;
@@ -384,6 +386,11 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
         float,
         notes: std::mem::take(notes),
     })
+}
+
+/// Returns a length for people: not 300 digits of one that is out of this world.
+fn millimetres(x: f64) -> String {
+    if x < 1e6 { format!("{x:.3}") } else { format!("{x:.3e}") }
 }
 
 /// Returns the samples of a slice, little-endian: as stored, or rescaled to f32 if `float`.

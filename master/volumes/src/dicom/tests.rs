@@ -255,6 +255,13 @@ fn dicom_errors_name_file_field_and_remedy() {
     let dir = folder(&[("1", good(0.0)), ("2", good(1.0)), ("3", good(3.0))]);
     let opened = crate::open_with(dir.path(), &crate::Hints::default()).unwrap();
     assert!(opened.notes[0].contains("1.000 to 2.000 mm apart"), "{:?}", opened.notes);
+    // Also where the gap has 300 digits, or is refused for it.
+    let dir = folder(&[("1", good(0.0)), ("2", good(1.0)), ("3", good(1e300))]);
+    let line = match crate::open_with(dir.path(), &crate::Hints::default()) {
+        Ok(opened) => opened.notes.join(" "),
+        Err(e) => e.to_string(),
+    };
+    assert!(line.len() < 400, "{line}");
 }
 
 #[test]

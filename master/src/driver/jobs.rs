@@ -91,8 +91,9 @@ impl Driver {
             self.flights.remove(&frame);
             self.scheduler.handle(&self.clock, Happened::CancelFrame { frame });
         }
-        self.deactivate(id);
+        // In this order: a watcher ends at what it finds of a job that is retired.
         self.jobs.lock().set_state(id, state);
+        self.deactivate(id);
         self.jobs.ring();
         self.refresh_states();
     }

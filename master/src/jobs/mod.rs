@@ -361,9 +361,11 @@ impl Table {
         job.view.state = state;
     }
 
-    /// Notes that dropped frames of a job can't be rendered again.
+    /// Notes that dropped frames of a job that is over can't be rendered again.
     pub(crate) fn retire(&mut self, id: JobId) {
         if let Some(job) = self.jobs.get_mut(&id) {
+            // A watcher that looks now ends with this state as its last.
+            debug_assert!(job.view.state.is_over(), "{id} is retired as {:?}", job.view.state);
             job.retired = true;
         }
     }

@@ -43,7 +43,7 @@ pub enum BrickOrder {
 /// bounded by what the driver sends:
 pub struct WorkerLink {
     /// Control messages: at most the leases that the scheduler has lent the worker and, until
-    /// silence ends the link, its pings (`4 * Config::silence / Config::hush`, 12 by default).
+    /// silence ends the link, its pings (`4 * Config::silence / Config::unresponsive_after`, 12 by default).
     pub control: mpsc::UnboundedSender<ToWorker>,
     /// Orders for bricks: at most one for each brick that the worker lacks, as no brick is ordered
     /// twice.

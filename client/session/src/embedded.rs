@@ -92,7 +92,7 @@ impl Cluster {
     ) -> Result<Cluster, Fail> {
         let mut config = MasterConfig::new(volume, orientation);
         config.schedule.silence = SILENCE;
-        config.schedule.hush = 0;
+        config.schedule.unresponsive_after = 0;
         config.record = record;
         let master = start_master(config)?;
         let (stop, stopped) = watch::channel(false);

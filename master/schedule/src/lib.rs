@@ -72,7 +72,7 @@ pub struct Config {
     pub silence: Micros,
     /// Silence of a worker with leases after which others are lent its tasks too, in microseconds; 0:
     /// never. It is pinged four times as often.
-    pub hush: Micros,
+    pub unresponsive_after: Micros,
     /// Deadline of a task's first lease, in microseconds. Each attempt doubles it.
     pub lease: Micros,
     /// Number of different workers that must have failed at a tile before it is given up, and its
@@ -99,7 +99,7 @@ impl Default for Config {
     /// - heartbeat 1 s, silence 3 s: docs/design/promises.md R2 allows 3 s to find a partitioned
     ///   worker and no false alarm at twice the load its cores can bear; three pings must go
     ///   unanswered.
-    /// - hush 1 s: a worker that is stopped holds up a frame for no longer. At half, a machine that
+    /// - unresponsive_after 1 s: a worker that is stopped holds up a frame for no longer. At half, a machine that
     ///   swaps has its tiles drawn twice; at double, a viewer waits for two seconds.
     /// - lease 60 s: the slowest tile that still is honest work. At half, a 256x256 tile of a large
     ///   volume on a shared core is rendered twice for nothing; at double, a worker that lives but
@@ -113,7 +113,7 @@ impl Default for Config {
         Config {
             heartbeat: 1_000_000,
             silence: 3_000_000,
-            hush: 1_000_000,
+            unresponsive_after: 1_000_000,
             lease: 60_000_000,
             poison_after: 3,
             audit_ppm: 10_000,

@@ -356,11 +356,11 @@ impl Scheduler {
         for (worker, nonce) in self.cluster.roster.beat(now, &self.cluster.config) {
             self.cluster.send(worker, ToWorker::Ping { nonce });
         }
-        let hushed = self.cluster.roster.hush(now, &self.cluster.config);
-        for &worker in &hushed {
+        let unresponsive = self.cluster.roster.mark_unresponsive(now, &self.cluster.config);
+        for &worker in &unresponsive {
             self.active.iter_mut().for_each(|frame| frame.share_leases(worker));
         }
-        if self.cluster.roster.end_pauses(now) || !hushed.is_empty() {
+        if self.cluster.roster.end_pauses(now) || !unresponsive.is_empty() {
             freed_worker = None;
         }
         for frame in &mut self.active {

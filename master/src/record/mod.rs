@@ -84,7 +84,7 @@ struct Head {
     silence: u64,
     /// Off before version 5.
     #[serde(default)]
-    hush: u64,
+    unresponsive_after: u64,
     lease: u64,
     poison_after: u32,
     queue_ahead: u32,

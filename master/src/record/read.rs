@@ -273,9 +273,10 @@ fn config(head: &Head) -> Result<Config, String> {
             head.pixels_version, head.program
         ));
     }
-    let &Head { heartbeat, silence, hush, lease, poison_after, queue_ahead, .. } = head;
+    let &Head { heartbeat, silence, unresponsive_after, lease, poison_after, queue_ahead, .. } =
+        head;
     let sane = 1..=1 << 50;
-    if ![heartbeat, silence, hush.max(1), lease].iter().all(|t| sane.contains(t))
+    if ![heartbeat, silence, unresponsive_after.max(1), lease].iter().all(|t| sane.contains(t))
         || queue_ahead > 1 << 20
     {
         return Err("has settings that no master has".into());
@@ -284,7 +285,7 @@ fn config(head: &Head) -> Result<Config, String> {
     Ok(Config {
         heartbeat,
         silence,
-        hush,
+        unresponsive_after,
         lease,
         poison_after,
         audit_ppm,

@@ -130,7 +130,9 @@ fn write(mut out: impl Write, entries: &Receiver<Entry>) -> std::io::Result<Reco
 
 /// Returns the first line of a record.
 fn head(config: &Config) -> Head {
-    let &Config { heartbeat, silence, hush, lease, poison_after, queue_ahead, .. } = config;
+    let &Config {
+        heartbeat, silence, unresponsive_after, lease, poison_after, queue_ahead, ..
+    } = config;
     let audits = (config.audit_ppm, config.audit_first, config.audit_seed);
     Head {
         version: VERSION,
@@ -139,7 +141,7 @@ fn head(config: &Config) -> Head {
         protocol_version: PROTOCOL_VERSION,
         heartbeat,
         silence,
-        hush,
+        unresponsive_after,
         lease,
         poison_after,
         queue_ahead,

@@ -5,8 +5,8 @@
 //! | Deadline | Set when | After | Then |
 //! |---|---|---|---|
 //! | next ping | joined, pinged | 0, `heartbeat` | ping again |
-//! | ping while it has leases | anything heard, pinged | `hush` / 4 | ping again |
-//! | hush | it has leases; anything heard | `hush` | its tasks are lent to others too |
+//! | ping while it has leases | anything heard, pinged | `unresponsive_after` / 4 | ping again |
+//! | unresponsive_after | it has leases; anything heard | `unresponsive_after` | its tasks are lent to others too |
 //! | silence | anything heard | `silence` | the worker is lost |
 //! | lease (`task_queue`) | task leased | `lease` * 2^attempt | another worker gets it too |
 //! | speculation (`speculate`) | task leased | twice its estimate | an idle worker gets a copy |
@@ -84,9 +84,9 @@ pub(crate) struct Worker {
     /// When it was pinged last, and since when it has leases.
     pinged: Micros,
     busy_since: Micros,
-    /// It has leases and was not heard for `hush`: it takes no more for now, and others have its
+    /// It has leases and was not heard for `unresponsive_after`: it takes no more for now, and others have its
     /// tasks too.
-    is_hushed: bool,
+    is_unresponsive: bool,
     /// Pings without a pong, oldest first: nonce and time.
     pings: VecDeque<(u64, Micros)>,
     offset: Option<Offset>,
@@ -116,7 +116,7 @@ impl Worker {
 
     /// Whether the worker is active: it takes leases.
     pub(crate) fn is_active(&self) -> bool {
-        !self.leaving && !self.is_spare && !self.is_hushed && self.paused_until.is_none()
+        !self.leaving && !self.is_spare && !self.is_unresponsive && self.paused_until.is_none()
     }
 
     /// Since when it owes a sign of life, while it has leases.
@@ -126,18 +126,19 @@ impl Worker {
 
     /// When it is pinged next.
     fn ping_due(&self, config: &Config) -> Micros {
-        if self.leases == 0 || config.hush == 0 {
+        if self.leases == 0 || config.unresponsive_after == 0 {
             return self.next_ping;
         }
-        let soon = self.quiet_since().max(self.pinged).saturating_add(config.hush / 4);
+        let soon =
+            self.quiet_since().max(self.pinged).saturating_add(config.unresponsive_after / 4);
         self.next_ping.min(soon)
     }
 
     /// When others are lent its tasks.
-    fn hush_due(&self, config: &Config) -> Micros {
-        match self.leases == 0 || config.hush == 0 || self.is_hushed {
+    fn unresponsive_due(&self, config: &Config) -> Micros {
+        match self.leases == 0 || config.unresponsive_after == 0 || self.is_unresponsive {
             true => Micros::MAX,
-            false => self.quiet_since().saturating_add(config.hush),
+            false => self.quiet_since().saturating_add(config.unresponsive_after),
         }
     }
 
@@ -230,7 +231,7 @@ impl Roster {
             next_ping: now,
             pinged: now,
             busy_since: now,
-            is_hushed: false,
+            is_unresponsive: false,
             pings: VecDeque::new(),
             offset: None,
         };
@@ -419,7 +420,7 @@ impl Roster {
     pub(crate) fn heard(&mut self, id: WorkerId, now: Micros) {
         let Some(w) = self.workers.get_mut(id) else { return };
         w.heard = w.heard.max(now);
-        if std::mem::take(&mut w.is_hushed) {
+        if std::mem::take(&mut w.is_unresponsive) {
             self.woken.push(id);
             self.changes += 1;
             self.survey();
@@ -433,20 +434,20 @@ impl Roster {
 
     /// Returns the workers with leases that were silent for so long that others get their tasks
     /// too, each once.
-    pub(crate) fn hush(&mut self, now: Micros, config: &Config) -> Vec<WorkerId> {
+    pub(crate) fn mark_unresponsive(&mut self, now: Micros, config: &Config) -> Vec<WorkerId> {
         if now < self.quiet_until {
             return Vec::new();
         }
-        let mut hushed = Vec::new();
-        for (id, w) in self.workers.iter_mut().filter(|(_, w)| w.hush_due(config) <= now) {
-            w.is_hushed = true;
-            hushed.push(id);
+        let mut unresponsive = Vec::new();
+        for (id, w) in self.workers.iter_mut().filter(|(_, w)| w.unresponsive_due(config) <= now) {
+            w.is_unresponsive = true;
+            unresponsive.push(id);
         }
-        if !hushed.is_empty() {
+        if !unresponsive.is_empty() {
             self.changes += 1;
             self.survey();
         }
-        hushed
+        unresponsive
     }
 
     /// Notes the time; see the head of this file.
@@ -500,7 +501,7 @@ impl Roster {
             .collect();
         let due = |w: &Worker| {
             let due = w.ping_due(config).min(w.heard.saturating_add(config.silence));
-            due.min(w.hush_due(config)).min(w.paused_until.unwrap_or(Micros::MAX))
+            due.min(w.unresponsive_due(config)).min(w.paused_until.unwrap_or(Micros::MAX))
         };
         self.quiet_until = self.workers.values().map(due).min().unwrap_or(0);
         beaten

@@ -13,6 +13,7 @@ use std::fs::{File, Permissions};
 use std::io::{BufWriter, Error, ErrorKind, Result, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use tempfile::NamedTempFile;
 
@@ -79,7 +80,8 @@ const TRY_AGAIN: Duration = Duration::from_secs(1);
 #[derive(Debug, Default)]
 pub struct DiskWait {
     given_up: AtomicBool,
-    waiting: AtomicBool,
+    /// What to say when the wait is over; `None` while nothing waits.
+    waiting: Mutex<Option<&'static str>>,
 }
 
 impl DiskWait {
@@ -94,20 +96,20 @@ impl DiskWait {
         path: &Path,
         mut write: impl FnMut() -> Result<T>,
     ) -> Result<T> {
-        let mut over = "there is room again";
         loop {
             let e = match write() {
                 Err(e) if !self.given_up.load(Ordering::SeqCst) => e,
                 other => {
-                    if other.is_ok() && self.waiting.swap(false, Ordering::SeqCst) {
+                    // Whichever thread is first says it, in the words of the one that warned.
+                    let over = if other.is_ok() { self.waiting().take() } else { None };
+                    if let Some(over) = over {
                         progress::note(&format!("{over}: going on"));
                     }
                     return other;
                 }
             };
             let Some([what, until, again]) = weather(&e) else { return Err(e) };
-            over = again;
-            if !self.waiting.swap(true, Ordering::SeqCst) {
+            if self.waiting().replace(again).is_none() {
                 progress::warn(&one_line(&format!(
                     "paused: {what} to write {} ({}); it goes on by itself when {until}, Ctrl-C \
                      ends it and keeps what is done",
@@ -117,6 +119,10 @@ impl DiskWait {
             }
             self.wait();
         }
+    }
+
+    fn waiting(&self) -> MutexGuard<'_, Option<&'static str>> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn wait(&self) {

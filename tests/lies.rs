@@ -26,8 +26,9 @@ const PATIENT: Duration = Duration::from_secs(60);
 fn master() -> Master {
     let volume = slabcast_volumes::open("formula:spheres:40".as_ref()).expect("a formula");
     let orientation = Orientation::new(None, None).expect("the defaults");
-    let config = MasterConfig::new(volume, orientation);
-    Master::start(MasterConfig { audit_ppm: Some(10_000), ..config }).expect("a master")
+    let mut config = MasterConfig::new(volume, orientation);
+    config.audit_ppm = Some(10_000);
+    Master::start(config).expect("a master")
 }
 
 fn request() -> PathRequest {

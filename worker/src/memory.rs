@@ -2,7 +2,7 @@
 //!
 //! `--memory` is for the whole process, since that is what a control group or a full machine kills.
 //! So bricks are counted by the bytes that they take in memory, not by their encoded ones, and get what
-//! is left beside [`rest_bytes`]: the program, its threads' scratch, directories, tables, stalled
+//! is left beside `rest_bytes`: the program, its threads' scratch, directories, tables, stalled
 //! regions, and what the allocator keeps.
 //!
 //! The rest is an estimate. Measuring it by the peak of the process was tried: one spike (a link that

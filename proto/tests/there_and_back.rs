@@ -358,3 +358,13 @@ fn checksum_finds_every_flipped_bit_of_a_brick() {
         assert_eq!(batch.broken, [bricks[which].id], "flip {flip}");
     }
 }
+
+#[test]
+fn reasons_of_peers_lose_what_moves_a_cursor() {
+    let reason = "no \u{1b}[2Jtile\r\nWARN forged\u{7f}".to_string();
+    let wire = convert::from_worker_to_wire(&ToMaster::Goodbye { reason });
+    let Ok(ToMaster::Goodbye { reason }) = convert::from_worker_from_wire(wire) else {
+        panic!("it is a goodbye")
+    };
+    assert_eq!(reason, "no  [2Jtile  WARN forged ");
+}

@@ -216,7 +216,7 @@ fn state() -> impl Strategy<Value = model::JobState> {
 }
 
 pub fn notice() -> impl Strategy<Value = model::JobNotice> {
-    (state(), any::<[u64; 3]>(), any::<u32>(), ".{0,50}").prop_map(
+    (state(), any::<[u64; 3]>(), any::<u32>(), "\\PC{0,50}").prop_map(
         |(state, [frames_done, frames_failed, frames_total], render_threads, message)| {
             model::JobNotice {
                 state,
@@ -236,7 +236,7 @@ fn time() -> impl Strategy<Value = i64> {
 }
 
 pub fn job() -> impl Strategy<Value = model::Job> {
-    (("job-[0-9]{1,9}", "[a-z]{1,9}", ".{0,50}"), notice(), size(), format(), [time(), time()])
+    (("job-[0-9]{1,9}", "[a-z]{1,9}", "\\PC{0,50}"), notice(), size(), format(), [time(), time()])
         .prop_map(|((job_id, client_key, message), n, size, format, times)| model::Job {
             job_id,
             client_key,
@@ -344,7 +344,7 @@ pub fn stats() -> impl Strategy<Value = FrameStats> {
         (any::<u64>(), schedule, "[0-9a-f]{64}", "([0-9a-f]{64})?", any::<[u32; 2]>()),
         (vec(number(), 8), vec(worker_stats(), 0..5), any::<[u64; 10]>(), any::<Option<u64>>()),
         (vec(slab_stats(), 0..4), quality(Just(Sums::I32)), vec(left_out, 0..3), error_stats()),
-        (vec(poisoned, 0..3), prop::option::of(".{0,40}"), any::<bool>()),
+        (vec(poisoned, 0..3), prop::option::of("\\PC{0,40}"), any::<bool>()),
     )
         .prop_map(|(head, counts, lists, rest)| {
             let (frame, schedule, view_sha256, pixels_sha256, [v, pixels_version]) = head;

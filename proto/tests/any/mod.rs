@@ -212,7 +212,7 @@ pub fn to_master() -> impl Strategy<Value = ToMaster> {
     prop_oneof![
         hello().prop_map(ToMaster::Hello),
         result().prop_map(|r| ToMaster::Result(Box::new(r))),
-        (any::<u64>(), any::<u32>(), ".{0,50}").prop_map(|(t, e, reason)| ToMaster::Failed {
+        (any::<u64>(), any::<u32>(), "\\PC{0,50}").prop_map(|(t, e, reason)| ToMaster::Failed {
             task: TaskId(t),
             epoch: Epoch(e),
             reason
@@ -223,7 +223,7 @@ pub fn to_master() -> impl Strategy<Value = ToMaster> {
         (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksEvicted { set, bricks }),
         handed_over().prop_map(|piece| ToMaster::RegionSplit(Box::new(piece))),
         any::<[u64; 2]>().prop_map(|[nonce, clock_us]| ToMaster::Pong { nonce, clock_us }),
-        ".{0,50}".prop_map(|reason| ToMaster::Goodbye { reason }),
+        "\\PC{0,50}".prop_map(|reason| ToMaster::Goodbye { reason }),
     ]
 }
 
@@ -235,7 +235,7 @@ pub fn to_worker() -> impl Strategy<Value = ToWorker> {
                 ToWorker::Welcome { worker, heartbeat_ms, protocol_version }
             }
         ),
-        ".{0,50}".prop_map(|reason| ToWorker::Refused { reason }),
+        "\\PC{0,50}".prop_map(|reason| ToWorker::Refused { reason }),
         scene().prop_map(|s| ToWorker::Scene(Arc::new(s))),
         (any::<[u64; 2]>(), view(), prop::option::of(finish()), any::<bool>()).prop_map(
             |([f, s], view, finish, plain)| {
@@ -254,7 +254,7 @@ pub fn to_worker() -> impl Strategy<Value = ToWorker> {
         (key(), vec((0u32..1 << 27).prop_map(BrickId), 1..60))
             .prop_map(|(set, bricks)| ToWorker::DropBricks { set, bricks }),
         any::<u64>().prop_map(|nonce| ToWorker::Ping { nonce }),
-        ".{0,50}".prop_map(|reason| ToWorker::MasterEnding { reason }),
+        "\\PC{0,50}".prop_map(|reason| ToWorker::MasterEnding { reason }),
     ]
 }
 

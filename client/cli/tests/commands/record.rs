@@ -1,6 +1,6 @@
 //! `--record` and `slabcast lab replay` on real runs.
 
-use crate::program::{end, good, names, run, signal, slabcast, text, wait_for_text};
+use crate::program::{end, good, names, run, signal, slabcast, text, wait_for_text, wait_until};
 use std::process::Stdio;
 use std::time::Duration;
 
@@ -59,6 +59,11 @@ fn recorded_master_replays_identically_after_sigterm() {
         slabcast(dir, &args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap()
     };
     let mut workers = [worker("one"), worker("two")];
+    // A worker that is killed before it joined is never lost.
+    wait_until("two workers join", || {
+        let record = std::fs::read_to_string(dir.join("events.log.part")).unwrap_or_default();
+        record.matches("\"joined\"").count() >= 2
+    });
     let render = ["render", "--master", &address, "--size", "120x120", "--frames", "4", "-q"];
     good(dir, &render);
     let out = run(dir, &[&render[..], &["--record", "x.log"]].concat());

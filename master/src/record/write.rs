@@ -16,7 +16,7 @@ use std::io::{BufWriter, Write};
 use std::ops::Deref;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tracing::warn;
 
 /// Longest time that an entry waits in the writer's buffer: of a run that is killed, no more than a
@@ -76,13 +76,16 @@ fn write(mut out: impl Write, entries: &Receiver<Entry>) -> std::io::Result<Reco
         cut: Some("the disk fell behind the master".into()),
     };
     let (mut sets, mut scenes) = (BTreeSet::<BrickSetKey>::new(), BTreeSet::<SceneId>::new());
+    let mut flushed = Instant::now();
     loop {
+        // Pings come all the time: what was written is flushed in between them too.
+        if flushed.elapsed() >= FLUSH {
+            out.flush()?;
+            flushed = Instant::now();
+        }
         let entry = match entries.recv_timeout(FLUSH) {
             Ok(entry) => entry,
-            Err(RecvTimeoutError::Timeout) => {
-                out.flush()?;
-                continue;
-            }
+            Err(RecvTimeoutError::Timeout) => continue,
             Err(RecvTimeoutError::Disconnected) => break,
         };
         match entry {

@@ -139,7 +139,7 @@ pub(crate) struct Admitted {
     pub(crate) is_local: bool,
     /// Whether its pixels are believed without audits.
     pub(crate) is_trusted: bool,
-    /// What it is over all its links.
+    /// Host and name of the worker, which stay the same when it dials again.
     pub(crate) identity: WorkerIdentity,
 }
 

@@ -190,8 +190,8 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
     Ok(())
 }
 
-/// What the master may hold: as it is told, or half of what the machine or the control group has
-/// free now.
+/// Returns the shares of the master's memory budget in bytes. The budget is `memory`, or half of the free
+/// memory of the machine or control group.
 fn shares(memory: Option<u64>) -> Shares {
     let half = || available().map(|free| (free / 2).max(MEMORY));
     memory.or_else(half).map_or_else(Shares::default, Shares::of)

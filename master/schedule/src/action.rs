@@ -82,7 +82,7 @@ pub enum Action {
     ShutOut {
         /// The worker's last id.
         worker: WorkerId,
-        /// What it is over all its links.
+        /// Host and name of the worker, which stay the same when it dials again.
         identity: WorkerIdentity,
         /// The frame.
         frame: FrameId,

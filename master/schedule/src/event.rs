@@ -28,8 +28,8 @@ pub struct FrameJob {
     pub finish: Option<PixelEncoding>,
 }
 
-/// What a worker is over all its links, as far as the master can tell: two links of one identity
-/// are the same worker, whatever its id.
+/// Host and name of a worker. Ids are new with each link; links with the same host and name belong to
+/// the same worker.
 #[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct WorkerIdentity {
     /// The machine that it runs on, or the address that it calls from, without port.
@@ -53,8 +53,8 @@ pub enum Event {
         worker: WorkerId,
         /// Display name.
         name: String,
-        /// What the worker is over all its links. While another worker of the same identity is
-        /// linked, it counts as one more worker of that machine.
+        /// Host and name of the worker. If a worker of the same host and name is linked already, the
+        /// new one counts as another worker on that host.
         identity: WorkerIdentity,
         /// Number of render threads.
         threads: u32,

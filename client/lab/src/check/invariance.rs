@@ -35,7 +35,8 @@ const CUT_OTHERWISE: f64 = 1.0;
 /// count where opacity depends on them. 0.28 was the largest seen.
 const FIELD_FROM_BEHIND: f64 = 0.5;
 
-/// The same as [`CUT_OTHERWISE`] for fields, whose kernel is the wider B-spline. 1.3 was seen.
+/// Largest difference of a field on its side from the upright one where the kernel leans, in 1/255. The
+/// leaning B-spline is a product of profiles along other axes then. 1.3 was the largest seen.
 const FIELD_LEANS_OTHERWISE: f64 = 2.0;
 
 /// Error of fields that thinner planes don't make smaller, in 1/255: positions are rounded to 1/256

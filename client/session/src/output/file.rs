@@ -80,7 +80,7 @@ const TRY_AGAIN: Duration = Duration::from_secs(1);
 #[derive(Debug, Default)]
 pub struct DiskWait {
     given_up: AtomicBool,
-    /// What to say when the wait is over; `None` while nothing waits.
+    /// Text of the note that ends the wait, such as "the folder is back"; `None` while no thread waits.
     waiting: Mutex<Option<&'static str>>,
 }
 

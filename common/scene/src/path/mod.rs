@@ -445,8 +445,8 @@ impl Cameras<'_> {
     }
 }
 
-/// What the cameras of a path need beside the path itself. It grows with the keys or points of a
-/// path, and not with its frames.
+/// Lattice, orientation and curve from which the camera of each frame of a path is made. Its size grows
+/// with the number of keys or points, not with the number of frames.
 pub struct Prepared {
     lattice: Lattice,
     orientation: Orientation,

@@ -56,7 +56,7 @@ pub(crate) struct Newcomer {
 #[derive(Debug)]
 pub(crate) struct Worker {
     pub(crate) name: Arc<str>,
-    /// What it is over all its links.
+    /// Host and name of the worker, which stay the same when it dials again.
     pub(crate) identity: Arc<WorkerIdentity>,
     pub(crate) reputation: Reputation,
     pub(crate) threads: u32,

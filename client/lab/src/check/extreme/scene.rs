@@ -131,13 +131,17 @@ pub(super) fn judge(shot: &Shot, pixels: usize, tools: &Tools) -> Result<Vec<Row
     Ok(rows)
 }
 
-/// Draws `shot`, which is classified after reconstruction, everywhere and once more with nothing shut;
-/// judges a sample of `pixels` by the limit.
+/// Draws `shot`, which is classified after reconstruction, serially, on threads and by clusters, and once
+/// more without a cut-off. Returns rows for two properties:
 ///
-/// What the cut-off leaves out is within its bound, on every pixel. With nothing shut, thinner planes
-/// come as near to the limit as [`FIELD_RMSE`], or nearer than those of the default by a quarter. That is
-/// not judged where there is NaN, which the limit leaves out and sheets take for an invisible code, nor
-/// where a pixel is larger than a vox, since positions are rounded to 1/256 pixel.
+/// - pixels without a cut-off differ from pixels with one by no more than [`cutoff_bound`];
+/// - planes of [`FIELD_THIN`] have an RMSE against the f64 limit of at most [`FIELD_RMSE`], or of 3/4 of
+///   the RMSE of default planes. Volumes with NaN have no such row: the limit leaves NaN out, and sheets
+///   take it for an invisible code. Nor have pictures whose pixels are larger than a vox: positions are
+///   rounded to 1/256 pixel.
+///
+/// # Errors
+/// If a master would refuse the shot.
 fn judge_field(shot: &Shot, pixels: usize, tools: &Tools) -> Result<Vec<Row>, Fail> {
     let ready = shot.ready()?;
     let (picture, trouble) = shot.everywhere(&ready, tools)?;
@@ -170,10 +174,10 @@ fn judge_field(shot: &Shot, pixels: usize, tools: &Tools) -> Result<Vec<Row>, Fa
 
 /// Draws `shot` everywhere, and twice more with nothing shut; judges a sample of `pixels`.
 ///
-/// Three things must hold. What the cut-off leaves out is within its bound, on every pixel. With
-/// nothing shut, a pixel is no farther from its own sheets in f64 than its enclosure says. And
-/// where rays are parallel its opacity, which does not depend on the thickness of sheets at all,
-/// is no farther from the limit than that.
+/// Three things must hold. Pixels without a cut-off differ from pixels with one by no more than
+/// [`cutoff_bound`]. Without a cut-off, a pixel is no farther from the same sheets in f64 than its
+/// [`Enclosure`] says. Where rays are parallel, opacity does not depend on the thickness of sheets, and is
+/// no farther from the limit than the enclosure says.
 fn judge_before(shot: &Shot, pixels: usize, tools: &Tools) -> Result<Vec<Row>, Fail> {
     let ready = shot.ready()?;
     let (picture, trouble) = shot.everywhere(&ready, tools)?;

@@ -156,7 +156,7 @@ async fn truths() -> Vec<Scene> {
     scenes
 }
 
-/// What was done and seen so far.
+/// Counts of jobs, frames, kills, stops and errors so far.
 #[derive(Default)]
 struct Tally {
     counts: BTreeMap<&'static str, u64>,

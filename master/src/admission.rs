@@ -120,7 +120,7 @@ fn check(hello: &Hello, rehearses: bool) -> Result<u32, AttachError> {
 /// One worker's link and what is known of it.
 struct Attached {
     link: WorkerLink,
-    /// Its name, as other parts show it.
+    /// Display name of the worker.
     name: String,
     identity: WorkerIdentity,
     address: String,
@@ -146,7 +146,7 @@ pub(crate) struct Admitted {
 /// A worker, for the log.
 pub(crate) struct Who<'a> {
     pub(crate) name: &'a str,
-    /// Its machine and its name there.
+    /// Host and name of the worker.
     pub(crate) identity: &'a WorkerIdentity,
     pub(crate) address: &'a str,
 }
@@ -285,7 +285,7 @@ impl WorkerTable {
         }
     }
 
-    /// What the log says of a worker.
+    /// Returns name, identity and address of a worker, for log lines; `None` if it is not linked.
     pub(crate) fn who(&self, worker: WorkerId) -> Option<Who<'_>> {
         let Attached { name, identity, address, .. } = self.attached.get(&worker)?;
         Some(Who { name, identity, address })

@@ -1,4 +1,4 @@
-//! What a worker may cost the master: its link pays for what it says.
+//! Rate limit of a worker's messages: each link has an account that its messages draw on.
 //!
 //! Each message of a worker takes time of the driver's one thread and of the threads that read
 //! streams, and a list of bricks takes as much more as it is long. An honest worker answers: it says
@@ -25,7 +25,7 @@ use std::time::Duration;
 /// bricks at once.
 const MOST: u64 = 1 << 18;
 
-/// What fills an account in a second: 1.3 % of the driver for a link that gives nothing back.
+/// Credit that an account gains each second: 1.3 % of the driver for a link that sends no results.
 const TRICKLE_PER_SEC: u64 = 1 << 17;
 
 /// Cost of a message, beside what is in it: 1.6 us of the driver.
@@ -34,10 +34,12 @@ const MESSAGE: u64 = 16;
 /// Bytes of a result that cost one: 0.1 us of decoding.
 const BYTES: u64 = 64;
 
-/// What a brick that was sent is worth: it is wanted in a message, and evicted in another.
+/// Credit for a brick that the master sent. It pays for one message that asks for the brick and one that
+/// reports its eviction.
 const BRICK_SENT: u64 = 2 * MESSAGE + 2;
 
-/// What a batch of bricks is worth: its bricks are acknowledged, or broken.
+/// Credit for a batch of bricks that the master sent. It pays for two messages that acknowledge the bricks
+/// or report them broken.
 const BATCH_SENT: u64 = 2 * MESSAGE;
 
 /// The account of one link. See the head of the file.
@@ -112,7 +114,7 @@ impl Account {
     }
 }
 
-/// What a message costs.
+/// Returns the credit that a message draws.
 fn cost(message: &ToMaster) -> u64 {
     MESSAGE
         + match message {

@@ -37,7 +37,7 @@ pub struct MasterConfig {
     pub orientation: Orientation,
     /// Bytes that the master may hold, by what takes them.
     pub shares: Shares,
-    /// What one address may have at a time.
+    /// Caps of jobs, watchers and connections of one client address.
     pub peer_limits: PeerLimits,
     /// Whether clients of other machines are told the name of the volume's file.
     pub show_names: bool,

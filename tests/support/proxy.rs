@@ -12,13 +12,13 @@ use tokio::net::{TcpListener, TcpStream};
 /// Bytes of a stream that are damaged.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Place {
-    /// Those of messages.
+    /// Bytes of gRPC messages.
     Messages,
-    /// The five before each gRPC message: whether it is compressed, and its length.
+    /// The five bytes before each gRPC message: whether it is compressed, and its length.
     Lengths,
 }
 
-/// What a proxy does to the DATA frames of one direction.
+/// Bit flips in the DATA frames of one direction of a proxy.
 #[derive(Debug)]
 pub(crate) struct Noise {
     /// One frame in so many has a bit flipped; 0: none.

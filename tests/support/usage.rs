@@ -1,4 +1,4 @@
-//! What processes take while a test runs: memory, descriptors and threads, from /proc, as a table
+//! Memory, descriptors and threads of processes while a test runs, from /proc, as a table
 //! and as lines through its figures.
 
 #![allow(dead_code, reason = "each test program uses a part of it")]
@@ -8,7 +8,7 @@ use std::io::Write;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// What one process took at one time.
+/// Memory, descriptors and threads of one process at one time.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sample {
     /// Time since the table began.

@@ -91,7 +91,7 @@ impl Driver {
         }
     }
 
-    /// What a frame takes while it is made, and when it is finished.
+    /// Returns the memory of a frame in bytes, while it is rendered and when it is finished.
     fn bytes_of(&self, candidate: &Candidate) -> (u64, u64) {
         let Some(job) = self.active.get(candidate.job) else { return (0, 0) };
         let [w, h] = job.request.path.size.map(u64::from);

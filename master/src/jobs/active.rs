@@ -25,7 +25,7 @@ pub(crate) struct ActiveJob {
     /// The scene of all frames; of a tween, all but the transfer function.
     pub(crate) scene: Arc<SceneSpec>,
     pub(crate) tween: Option<Tween>,
-    /// What the job's brick set holds: what it needs, or more.
+    /// Voxels and data in the job's brick set: those that the job needs, or more.
     pub(crate) bricks: BrickNeeds,
     pub(crate) views: Views,
     /// The next frame that was never rendered, or one before it.

@@ -119,8 +119,8 @@ enum Noted {
 struct NotedWorker {
     w: u64,
     name: String,
-    /// Its machine and its name there, which tell it from others; without, each link counts as a
-    /// worker of its own (before version 5).
+    /// Host and name of the worker. `None` in records before version 5, in which each link counts as a
+    /// worker of its own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     who: Option<(String, String)>,
     threads: u32,

@@ -28,7 +28,7 @@ const PREFACE: Duration = Duration::from_secs(3);
 /// Time for which a connection that has been of use may have no call.
 const IDLE: Duration = Duration::from_secs(600);
 
-/// What is known of a connection.
+/// Age, use and deadlines of a connection.
 pub(super) struct State {
     since: Instant,
     patience: Duration,
@@ -111,7 +111,7 @@ impl Drop for Stay {
     }
 }
 
-/// Who calls, in the extensions of each request.
+/// Client of a request: its connection, kept in the request's extensions.
 #[derive(Clone)]
 pub(super) struct Peer {
     pub(super) tcp: TcpConnectInfo,

@@ -1,4 +1,4 @@
-//! What every call passes, whichever service it is for.
+//! Limits that every call of either service passes.
 //!
 //! - A request comes whole within the patience of [`PeerLimits`], and all that are on their way together take at most
 //!   [`ARRIVING_BYTES`]; streams of workers are exempt, as they never end.

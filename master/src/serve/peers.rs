@@ -1,4 +1,4 @@
-//! What each address may have at a time, and what is logged of those that want more.
+//! Caps of jobs, watchers and connections by client address, and log lines of clients that reach them.
 //!
 //! Until jobs have owners an address is all that is known of a client. So one address may have a
 //! share of each thing that runs out, and the others find the rest free. Clients behind one address
@@ -12,7 +12,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 use tracing::warn;
 
-/// What one address may have at a time.
+/// Caps of jobs, watchers and connections of one client address.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PeerLimits {
     /// Jobs in progress, of 200.

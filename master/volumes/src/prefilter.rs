@@ -71,7 +71,8 @@ fn filter(rows: &mut [f32], n: usize, width: usize) {
     }
 }
 
-/// The same along the last axis, whose rows are whole layers, in parallel within each layer.
+/// Filters `n` layers of `width` samples along the direction across them. Samples of a layer are
+/// filtered in parallel.
 fn filter_layers(all: &mut [f32], n: usize, width: usize) {
     if n < 2 {
         return;

@@ -109,7 +109,7 @@ pub(crate) struct Folder {
     handle: std::os::fd::OwnedFd,
 }
 
-/// What a name in a [`Folder`] is.
+/// Kind of a name in a [`Folder`].
 #[derive(Debug)]
 pub(crate) enum Inside {
     /// A regular file, and its length in bytes.
@@ -138,7 +138,7 @@ impl Folder {
     /// Opens what is called `name`, a path from this folder.
     ///
     /// # Errors
-    /// The system refuses to open something that lies inside.
+    /// The system refuses to open a file or folder inside.
     pub(crate) fn find(&self, name: &Path) -> std::io::Result<Inside> {
         // From the folder, so that the kernel takes it for a path beneath.
         let below = name.strip_prefix(&self.path).unwrap_or(name);

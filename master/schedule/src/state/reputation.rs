@@ -19,7 +19,7 @@ const LONGEST_WORKER_PAUSE_US: Micros = 10_000_000;
 /// each time fills no memory. The one that was seen last longest ago is forgotten first.
 const MAX_REMEMBERED: usize = 4096;
 
-/// What is remembered of a worker.
+/// Failures, results and pauses of a worker, kept over its links.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Reputation {
     /// Failures, less results since.

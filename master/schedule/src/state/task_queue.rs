@@ -60,7 +60,7 @@ pub(crate) struct Failure {
     pub(crate) who: Arc<WorkerIdentity>,
     /// How often.
     pub(crate) times: u32,
-    /// What it said last when it refused the task; `None`: it was lost with it.
+    /// Reason the worker gave when it refused the task last; `None` if its link was lost instead.
     pub(crate) said: Option<String>,
 }
 

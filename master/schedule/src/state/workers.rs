@@ -84,8 +84,8 @@ pub(crate) struct Worker {
     /// When it was pinged last, and since when it has leases.
     pinged: Micros,
     busy_since: Micros,
-    /// It has leases and was not heard for `unresponsive_after`: it takes no more for now, and others have its
-    /// tasks too.
+    /// Whether the worker has leases and sent nothing for `Config::unresponsive_after`. It is lent nothing
+    /// then, and other workers may be lent its tasks.
     is_unresponsive: bool,
     /// Pings without a pong, oldest first: nonce and time.
     pings: VecDeque<(u64, Micros)>,

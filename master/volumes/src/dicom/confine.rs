@@ -227,7 +227,7 @@ mod tests {
     /// Names the folder to a process that confines itself and then attacks.
     const FOLDER_VARIABLE: &str = "SLABCAST_TEST_CONFINED";
 
-    /// What a parser that was taken over would try. Runs in a process of its own.
+    /// Tries the attacks of a parser under an attacker's control. Runs in a process of its own.
     fn attack(folder: &Path) {
         let parent = rustix::process::getppid();
         let lacks = super::confine(folder);

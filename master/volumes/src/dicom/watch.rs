@@ -54,7 +54,7 @@ impl Watched {
     /// Waits for the end of a process whose pipes are closed, and kills it if it lingers.
     ///
     /// # Errors
-    /// The system does not tell.
+    /// The system call that waits for the process fails.
     pub(super) fn end(&mut self) -> std::io::Result<ExitStatus> {
         let since = Instant::now();
         loop {

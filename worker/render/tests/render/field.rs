@@ -90,7 +90,7 @@ fn cropped_and_modulated_pictures_approach_the_limit() {
     approach_the_limit(&waves(), Kernel::Bspline);
 }
 
-/// The same for coefficients, some of which lie beyond the smallest and the largest value.
+/// Coefficients beyond the smallest and the largest value are drawn as in the f64 limit.
 #[test]
 fn pictures_of_coefficients_approach_the_limit() {
     let mut volume = waves();

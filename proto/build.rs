@@ -16,9 +16,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let descriptors = protox::compile(FILES, ["."])?;
     let out = PathBuf::from(std::env::var_os("OUT_DIR").ok_or("cargo sets OUT_DIR")?);
     std::fs::write(out.join("slabcast_descriptor.bin"), descriptors.encode_to_vec())?;
-    // What can't be decoded on a worker's stream was damaged on its way, and is asked for again.
+    // Messages of either package have checksums: of clients each its own, of workers the stream's.
     for (package, codec) in [
-        ("slabcast.render.v1", "tonic_prost::ProstCodec"),
+        ("slabcast.render.v1", "crate::checked::CheckedCodec"),
         ("slabcast.cluster.v1", "crate::sealed::LenientCodec"),
     ] {
         // `Bytes` everywhere: a received brick or chunk is a part of the buffer it came in, not a

@@ -5,7 +5,7 @@
 #   simd      the renderer's tests on every instruction set of this machine, and its benches once
 #   faults    10,000 seeds of faults in the virtual cluster (SLABCAST_SEEDS)
 #   matrix    every combination of workers, threads, tiles, slabs, culling and links
-#   flips     100,000 flipped bits in each direction of a link, and as many of frames (SLABCAST_FLIPS)
+#   flips     100,000 flipped bits in each direction of a link, worker and client (SLABCAST_FLIPS)
 #   soak      an hour of jobs while workers are killed and stopped and clients cancel
 #             (SLABCAST_SOAK_MINUTES)
 #   long      tests of commands that take half a minute and more

@@ -233,27 +233,31 @@ async fn swallowed(swallows: Swallows, beside_another: bool) -> (Duration, usize
     (before.elapsed(), proxy.connections.load(Relaxed).div_ceil(2))
 }
 
-/// Watches jobs through a proxy that flips bits of what the master sends to the client.
+/// Calls that only ask, beside each job of [`watched`]: so that requests are damaged, too, of which
+/// a job alone needs two.
+const ASKED: usize = 20;
+
+/// Submits and watches jobs through a proxy that flips bits of what a client and its master send to
+/// each other.
 async fn watched(seed: u64, flips: u64, one_in: u64) {
     let truths = truths().await;
     let mut world = World::new().await;
-    let down = Noise::new(seed, one_in, flips, Place::Messages);
-    let proxy = Proxy::start(world.address.clone(), (Noise::none(), down.clone()), NONE).await;
+    let noise = [1, 2].map(|n| Noise::new(seed + n, one_in, flips, Place::Messages));
+    let [up, down] = noise.clone();
+    let proxy = Proxy::start(world.address.clone(), (up, down), NONE).await;
     world.dial("quiet", &world.address);
     let begin = Instant::now();
     let mut damaged = 0;
-    while down.left.load(Relaxed) > 0 {
+    while noise.iter().any(|n| n.left.load(Relaxed) > 0) {
         let request = world.request();
         let want = truths[(world.jobs as usize - 1) % 6].clone();
-        let direct = Client::connect(&world.address).await.expect("it listens");
-        let job = direct.submit(&request).await.expect("a good request");
         let got = tokio::time::timeout(PATIENT, async {
-            // A call that is not a watch may fail of a flip.
-            let client = loop {
-                if let Ok(client) = Client::connect(&proxy.address).await {
-                    break client;
-                }
-            };
+            let client = Client::connect(&proxy.address).await.expect("it listens");
+            let job = client.submit(&request).await.expect("a good request");
+            for _ in 0..ASKED {
+                let asked = client.job(&job).await.expect("it was just submitted");
+                assert_eq!((&asked.job_id, &asked.client_key), (&job, &request.client_key));
+            }
             let mut frames = client.follow(&job, 0, PATIENCE).await.expect("it is there");
             let mut got = Vec::new();
             while let Some(update) = frames.next().await.expect("a frame in the end") {
@@ -269,10 +273,10 @@ async fn watched(seed: u64, flips: u64, one_in: u64) {
         });
         assert_eq!(got.await.expect("no watch hangs"), want, "seed {seed}");
     }
-    let flips = down.flips.load(Relaxed);
+    let [up, down] = noise.each_ref().map(|n| n.flips.load(Relaxed));
     println!(
-        "{flips} flips of frames to a client in {} jobs of 3 frames: 0 false, 0 hung; {damaged} \
-         messages asked for again, {:.1?}",
+        "{up} flips up and {down} down between a client and its master in {} jobs of 3 frames: 0 \
+         false, 0 hung; {damaged} messages of watches asked for again, {:.1?}",
         world.jobs,
         begin.elapsed()
     );
@@ -281,15 +285,56 @@ async fn watched(seed: u64, flips: u64, one_in: u64) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn flipped_bits_of_frames_to_a_client_are_found_and_the_frame_comes_again() {
+async fn flipped_bits_between_a_client_and_its_master_change_no_picture() {
     watched(4, 60, 6).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "minutes; tests/nightly.sh flips"]
-async fn many_flips_of_frames_to_a_client_are_found() {
+async fn a_hundred_thousand_flips_each_way_change_no_picture_of_a_client() {
     let flips = std::env::var("SLABCAST_FLIPS").map_or(100_000, |n| n.parse().expect("a number"));
     watched(5, flips, 3).await;
+}
+
+/// A client that closes its watches and drops its calls, many at a time, loses no other stream of its
+/// connection. HTTP/2 servers close connections on which too many streams are reset.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn two_thousand_watches_closed_and_calls_dropped_64_at_a_time_end_no_other_watch() {
+    let mut world = World::new().await;
+    let client = Client::connect(&world.address).await.expect("it listens");
+    // No worker: the job waits, and so does its watch.
+    let job = client.submit(&world.request()).await.expect("a good request");
+    let mut other = client.watch(&job, 0).await.expect("it was just submitted");
+    assert!(matches!(other.next().await, Ok(Some(Update::Notice(_)))));
+    let mut dropped = 0;
+    for _ in 0..32 {
+        // Of 64 calls a connection has 31 at a time beside the first watch.
+        let closing = (0..64).map(|_| {
+            let (client, job) = (client.clone(), job.clone());
+            tokio::spawn(async move { client.watch(&job, 0).await.map(drop) })
+        });
+        for closed in closing.collect::<Vec<_>>() {
+            closed.await.expect("no panic").expect("a place for a watcher");
+        }
+        let calls = (0..64).map(|_| {
+            let (client, job) = (client.clone(), job.clone());
+            tokio::spawn(async move { client.job(&job).await.map(drop) })
+        });
+        let calls: Vec<_> = calls.collect();
+        tokio::time::sleep(Duration::from_millis(1)).await;
+        for call in calls {
+            call.abort();
+            dropped += u32::from(call.await.is_err());
+        }
+    }
+    assert!(dropped > 500, "many calls are dropped before their answer: {dropped}");
+    world.dial("quiet", &world.address);
+    let mut frames = 0;
+    while let Some(update) = other.next().await.expect("the first watch goes on") {
+        frames += u32::from(matches!(update, Update::Frame(_)));
+    }
+    assert_eq!(frames, 3);
+    world.stop.send_replace(true);
 }
 
 /// A worker that draws nothing and asks for all bricks of the set again and again, by lawful

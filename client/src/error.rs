@@ -198,13 +198,14 @@ impl ClientError {
     }
 }
 
-/// Whether a call ended because of the connection or because the master asks to call again. A
+/// Whether a call ended because of the connection, or because the master asks to call again. A
 /// status that was made on this side, by a connection that broke, has a source; one that a
 /// master sent has none.
 pub(crate) fn is_transient(status: &Status) -> bool {
     let sent_by_master = status.source().is_none();
     match status.code() {
-        Code::Unavailable => true,
+        // DATA_LOSS: a message was damaged on its way.
+        Code::Unavailable | Code::DataLoss => true,
         // Ours: the limit on an answer's time.
         Code::DeadlineExceeded => false,
         _ => !sent_by_master,

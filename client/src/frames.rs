@@ -34,11 +34,15 @@ const MAX_TRACE_BYTES: usize = 256 << 20;
 /// damages half of all frames damages so many in a row once in a million.
 const MOST_DAMAGED: u32 = 20;
 
-/// Whether a stream ended since a message could not be read: what this side says with INTERNAL and
-/// without a source. A master's own INTERNAL ends the next stream as well, until patience is used
+/// Time without a message after which a watch is begun anew. A master repeats its latest notice
+/// every 10 s. A chunk of 1 MiB takes as long at 280 kb/s.
+const STALLED: Duration = Duration::from_secs(30);
+
+/// Whether a stream ended since a message was damaged: DATA_LOSS, or INTERNAL from a message that
+/// can't be decoded. A master's own INTERNAL ends the next stream as well, until patience is used
 /// up.
 fn is_damage(status: &Status) -> bool {
-    status.code() == Code::Internal
+    matches!(status.code(), Code::DataLoss | Code::Internal)
 }
 
 /// An event of a job: news, or a frame.
@@ -101,6 +105,9 @@ pub struct FrameStream {
 struct Open {
     chunks: Streaming<wire::WatchFramesResponse>,
     since: Instant,
+    /// Since when the next message is waited for. Kept here, since [`FrameStream::next`] may be
+    /// dropped and called again.
+    waiting_since: Option<Instant>,
 }
 
 /// A time without a master.
@@ -188,24 +195,24 @@ impl FrameStream {
             self.reopen().await?;
             return Ok(None);
         };
-        let chunk = match open.chunks.message().await {
+        let since = *open.waiting_since.get_or_insert_with(Instant::now);
+        let Ok(message) = tokio::time::timeout_at(since + STALLED, open.chunks.message()).await
+        else {
+            let cause = format!("no message of the watch in {} s", STALLED.as_secs());
+            return Err(self.lost(cause));
+        };
+        open.waiting_since = None;
+        let chunk = match message {
             Ok(Some(chunk)) => chunk,
             Ok(None) if self.has_all() => {
                 self.over = true;
                 return Ok(None);
             }
             Ok(None) => {
-                return Err(ClientError::Lost {
-                    address: self.client.address().to_owned(),
-                    cause: "the stream ended before the job did".into(),
-                    retry_after: None,
-                });
+                return Err(self.lost("the stream ended before the job did".into()));
             }
             Err(status) if is_damage(&status) => return self.damaged(status.message()),
             Err(status) => return Err(ClientError::from_status(self.client.address(), &status)),
-        };
-        let Some(chunk) = convert::watch_checked(chunk) else {
-            return self.damaged("its checksum is false");
         };
         match convert::watch_from_wire(chunk).map_err(|e| self.client.protocol_error(&e))? {
             WatchMessage::Notice(notice) => {
@@ -244,11 +251,13 @@ impl FrameStream {
             return Ok(None);
         }
         self.damaged_in_a_row = 0;
-        Err(ClientError::Lost {
-            address: self.client.address().to_owned(),
-            cause: format!("frame {} is damaged on its way: {}", self.next, one_line(cause)),
-            retry_after: None,
-        })
+        let cause = format!("frame {} is damaged on its way: {}", self.next, one_line(cause));
+        Err(self.lost(cause))
+    }
+
+    /// Returns the error of a connection that broke for `cause`.
+    fn lost(&self, cause: String) -> ClientError {
+        ClientError::Lost { address: self.client.address().to_owned(), cause, retry_after: None }
     }
 
     /// Returns how many messages arrived damaged and were asked for again.
@@ -271,22 +280,16 @@ impl FrameStream {
     async fn reopen(&mut self) -> Result<(), ClientError> {
         self.partial = None;
         let (job_id, from_frame) = (self.job.clone(), self.next);
-        let request = wire::WatchFramesRequest { job_id, from_frame, checked: true };
+        let request = wire::WatchFramesRequest { job_id, from_frame };
         let mut render = self.client.render.clone();
         // Not the call's own deadline: that would end the stream, too.
         let stream = match tokio::time::timeout(ANSWER, render.watch_frames(request)).await {
             Ok(stream) => stream
                 .map_err(|status| ClientError::from_status(self.client.address(), &status))?
                 .into_inner(),
-            Err(_) => {
-                return Err(ClientError::Lost {
-                    address: self.client.address().to_owned(),
-                    cause: format!("no answer in {} s", ANSWER.as_secs()),
-                    retry_after: None,
-                });
-            }
+            Err(_) => return Err(self.lost(format!("no answer in {} s", ANSWER.as_secs()))),
         };
-        self.stream = Some(Open { chunks: stream, since: Instant::now() });
+        self.stream = Some(Open { chunks: stream, since: Instant::now(), waiting_since: None });
         Ok(())
     }
 

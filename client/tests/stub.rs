@@ -342,6 +342,29 @@ async fn watch_does_not_reconnect_and_names_the_master() {
     assert!(e.to_string().contains(&wire.address.to_string()), "{e}");
 }
 
+/// A stream within a connection that lives: what a proxy does that loses one stream of many.
+#[tokio::test]
+async fn follow_begins_a_watch_anew_that_is_silent_for_half_a_minute() {
+    let script = Script::default();
+    let mut silent = vec![notice(JobState::Running, 1, "")];
+    silent.extend(chunks(0, [1000, 900], "").into_iter().take(2));
+    script.watches.lock().unwrap().insert(0, (silent, false));
+    let client = Client::connect(&serve(&script).await.to_string()).await.unwrap();
+    let mut frames = client.follow("job-0", 0, Duration::from_secs(60)).await.unwrap();
+    assert!(matches!(frames.next().await, Ok(Some(Update::Notice(_)))));
+    let early = tokio::time::timeout(Duration::from_millis(200), frames.next()).await;
+    assert!(early.is_err(), "the frame is not whole, and its watch not late");
+    let mut whole = vec![notice(JobState::Done, 1, "")];
+    whole.extend(chunks(0, [1000, 900], ""));
+    script.watches.lock().unwrap().insert(0, (whole, true));
+    tokio::time::pause();
+    tokio::time::advance(Duration::from_secs(30)).await;
+    tokio::time::resume();
+    let whole = frame(&mut frames).await;
+    assert!(whole.bytes == pixels(0, [1000, 900]));
+    assert_eq!(*script.watched_from.lock().unwrap(), [0, 0]);
+}
+
 #[tokio::test]
 async fn follow_gives_up_after_its_patience() {
     let script = Script::default();

@@ -104,7 +104,7 @@ async fn error_details_name_reason_field_and_metadata() {
     let status = render.submit_path(other).await.unwrap_err();
     assert_status(&status, Code::AlreadyExists, Reason::ClientKeyTaken);
 
-    let ask = WatchFramesRequest { job_id, from_frame: 4, checked: false };
+    let ask = WatchFramesRequest { job_id, from_frame: 4 };
     let status = render.watch_frames(ask).await.unwrap_err();
     let details = assert_status(&status, Code::OutOfRange, Reason::FrameBeyondEnd);
     assert_eq!(details.number("frames_total"), Some(3));

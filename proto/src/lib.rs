@@ -4,7 +4,8 @@
 //! specification; [`render_v1`] and [`cluster_v1`] are what the compiler made of them. Nobody past
 //! this crate handles those messages: [`convert`] turns them into our own types or refuses,
 //! naming the field, and turns our types into them. [`status`] does the same for errors, and
-//! [`sealed`] checks what arrives on a worker's streams before anybody decodes it.
+//! [`sealed`] and [`checked`] find messages that were damaged on their way, before anybody decodes
+//! them: on a worker's streams, and between a client and its master.
 //!
 //! ```
 //! use slabcast_common::message::ToMaster;
@@ -23,6 +24,7 @@
 //! This crate refuses to know sockets, tasks and time. What a `.proto` promises about reconnects
 //! and silence is kept by `master`, `worker` and `client`.
 
+pub mod checked;
 pub mod convert;
 pub mod model;
 pub mod sealed;

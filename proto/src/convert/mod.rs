@@ -12,8 +12,8 @@
 //!   [`to_worker_to_wire`], [`to_worker_from_wire`].
 //! - **Bricks**, up: [`bricks_open_to_wire`], [`bricks_open_from_wire`]; down: [`BrickBatches`],
 //!   [`Down::Bricks`], [`bricks_from_wire`].
-//! - **WatchFrames**, down: [`frame_to_wire`], [`frame_failed_to_wire`], [`notice_to_wire`], [`watch_with_checksum`],
-//!   [`watch_checked`], [`watch_from_wire`].
+//! - **WatchFrames**, down: [`frame_to_wire`], [`frame_failed_to_wire`], [`notice_to_wire`],
+//!   [`watch_from_wire`].
 //! - Other calls of clients, up: [`submit_to_wire`], [`submit_from_wire`]; down: `job_...`,
 //!   `volume_...`, `worker_...`.
 
@@ -34,8 +34,8 @@ pub use fields::{local_field, wire_field};
 pub use render::{
     Page, StatisticsPart, StatisticsParts, frame_failed_to_wire, frame_to_wire, framing_from_wire,
     framing_to_wire, job_from_wire, job_to_wire, notice_to_wire, page_from_wire, page_token,
-    submit_from_wire, submit_to_wire, volume_from_wire, volume_to_wire, watch_checked,
-    watch_from_wire, watch_with_checksum, worker_from_wire, worker_to_wire,
+    submit_from_wire, submit_to_wire, volume_from_wire, volume_to_wire, watch_from_wire,
+    worker_from_wire, worker_to_wire,
 };
 
 use slabcast_common::volume::Digest32;

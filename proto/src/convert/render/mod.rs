@@ -16,10 +16,7 @@ pub use path::{framing_from_wire, framing_to_wire};
 pub use statistics::{StatisticsPart, StatisticsParts};
 pub use submit::{submit_from_wire, submit_to_wire};
 pub use volume::{volume_from_wire, volume_to_wire};
-pub use watch::{
-    frame_failed_to_wire, frame_to_wire, notice_to_wire, watch_checked, watch_from_wire,
-    watch_with_checksum,
-};
+pub use watch::{frame_failed_to_wire, frame_to_wire, notice_to_wire, watch_from_wire};
 
 use super::{WireError, enum_conversions};
 use crate::render_v1 as wire;

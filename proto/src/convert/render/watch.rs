@@ -17,7 +17,7 @@ enum_conversions!(state_to_wire, state_from_wire, JobState, wire::JobState, None
       Running <=> Running, Done <=> Done, Failed <=> Failed, Cancelled <=> Cancelled });
 
 /// Bytes of pixels, statistics or trace in a chunk. Tags, lengths and numbers beside them take
-/// less than 100 bytes, and a checksum 20.
+/// less than 100 bytes, and a checksum 6.
 const ROOM: usize = MAX_FRAME_CHUNK - 256;
 
 /// Cuts a finished frame into the messages of a watch, each of at most
@@ -101,30 +101,6 @@ fn message(message: wire::watch_frames_response::Message) -> wire::WatchFramesRe
     wire::WatchFramesResponse { message: Some(message) }
 }
 
-/// Wraps a message of a watch with its checksum, for a caller that wants it so.
-pub fn watch_with_checksum(message: &wire::WatchFramesResponse) -> wire::WatchFramesResponse {
-    let payload = Bytes::from(message.encode_to_vec());
-    let crc32c = crc32c::crc32c(&payload);
-    let checked = wire::CheckedMessage { crc32c, payload };
-    wire::WatchFramesResponse {
-        message: Some(wire::watch_frames_response::Message::Checked(checked)),
-    }
-}
-
-/// Takes a message of a watch out of its checksum, if it has one. Returns `None` if it was damaged
-/// on its way.
-pub fn watch_checked(message: wire::WatchFramesResponse) -> Option<wire::WatchFramesResponse> {
-    match message.message {
-        Some(wire::watch_frames_response::Message::Checked(checked)) => {
-            let is_whole = crc32c::crc32c(&checked.payload) == checked.crc32c;
-            is_whole.then(|| wire::WatchFramesResponse::decode(checked.payload).ok()).flatten()
-        }
-        // Left out is what a damaged tag makes of it.
-        None => None,
-        Some(_) => Some(message),
-    }
-}
-
 /// Converts one message of `WatchFrames`: a piece of a frame, its failure, or a notice.
 ///
 /// # Errors
@@ -137,9 +113,6 @@ pub fn watch_from_wire(response: wire::WatchFramesResponse) -> Result<WatchMessa
         }
         Message::Notice(notice) => {
             notice_from_wire(notice).map(WatchMessage::Notice).map_err(|e| e.within("notice"))
-        }
-        Message::Checked(_) => {
-            Err(WireError::value("checked", "was not asked for, or is within another"))
         }
         Message::Failed(wire::FrameFailed { frame, reason }) => {
             let reason = reason_from_wire("reason", reason).map_err(|e| e.within("failed"))?;

@@ -239,7 +239,8 @@ impl WorkerTable {
         self.next_id += 1;
         // A worker that rehearses stands for one on another machine.
         let is_local = caller.is_on(&hello.machine, &self.machine) && !hello.rehearses;
-        let is_here = caller.address.is_empty() || is_local && !self.audits.everybody;
+        let is_here = caller.address.is_empty()
+            || caller.is_surely_on(&hello.machine, &self.machine) && !self.audits.everybody;
         // A rehearsal draws nothing that could be compared.
         let is_trusted = is_here || self.audits.nobody || hello.rehearses;
         let heartbeat_ms = self.heartbeat_ms;

@@ -140,6 +140,14 @@ impl Caller {
     pub(crate) fn is_on(&self, machine: &str, own: &str) -> bool {
         if machine.is_empty() || own.is_empty() { self.is_local } else { machine == own }
     }
+
+    /// Whether a caller that says to be on `machine` is surely on that of a master on `own`, so that
+    /// its pixels need no audit: it is of this process, or calls from the address that it calls and
+    /// names the machine. Either alone can be had by a stranger: the address through a tunnel or a
+    /// published port, the name from whoever knows it.
+    pub(crate) fn is_surely_on(&self, machine: &str, own: &str) -> bool {
+        self.address.is_empty() || self.is_local && !own.is_empty() && machine == own
+    }
 }
 
 /// Bricks of one embedded batch: some 64 KiB, as over TCP, so that tiles start while the other
@@ -280,8 +288,13 @@ mod tests {
             (false, "", "a", false),
             (true, "a", "", true),
             (false, "a", "", false),
+            (true, "", "", true),
         ] {
-            assert_eq!(caller(is_local).is_on(machine, own), want, "{machine:?} on {own:?}");
+            let caller = caller(is_local);
+            assert_eq!(caller.is_on(machine, own), want, "{machine:?} on {own:?}");
+            let is_sure = is_local && machine == "a" && own == "a";
+            assert_eq!(caller.is_surely_on(machine, own), is_sure, "{machine:?} on {own:?}");
         }
+        assert!(Caller::default().is_surely_on("", "a"), "of this process");
     }
 }

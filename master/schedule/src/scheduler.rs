@@ -315,8 +315,8 @@ impl Scheduler {
         self.cluster.history.rates.forget(id);
     }
 
-    /// Forgets a worker that drew false pixels, and the frames that have tiles of it which nobody
-    /// has compared.
+    /// Forgets a worker that drew false pixels, its votes on other tiles, and the frames that have
+    /// tiles of it which nobody compared.
     fn shut_out(&mut self, lie: Lie, now: Micros) {
         let Lie { worker, who, frame, tile } = lie;
         // Other tiles of it may be compared after it is gone.
@@ -326,8 +326,8 @@ impl Scheduler {
         if self.shut_out.len() > MAX_SHUT_OUT {
             self.shut_out.pop_first();
         }
-        let agreed_at = self.cluster.roster.get(worker).map_or(0, |w| w.reputation.agreed_at);
-        let is_tainted = |f: &Frame| f.core().unaudited(worker).is_some_and(|at| at >= agreed_at);
+        self.active.iter_mut().for_each(|f| f.core_mut().table.queue.forget_votes(&who));
+        let is_tainted = |f: &Frame| f.core().has_unaudited(&who);
         let tainted: Vec<usize> =
             (0..self.active.len()).rev().filter(|i| is_tainted(&self.active[*i])).collect();
         self.lose(worker, false, now);

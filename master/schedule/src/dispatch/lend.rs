@@ -74,13 +74,10 @@ impl FrameCore {
         now: Micros,
     ) {
         cluster.roster.add_lease(id, now, &cluster.config);
-        // Pieces go on from what another worker drew, and are not compared.
-        let task = &self.table.queue.tasks[place as usize];
-        if !task.is_audited() && task.begun.is_none() && !is_copy {
-            let id_of_task = self.table.queue.id(place).0;
-            if cluster.audits(id, id_of_task) {
-                self.table.queue.audit(place);
-            }
+        // Copies and pieces too: a worker can tell them from other tasks, and would lie in those.
+        let is_audited = self.table.queue.tasks[place as usize].is_audited();
+        if !is_audited && cluster.audits(id, self.table.queue.id(place).0) {
+            self.table.queue.audit(place);
         }
         if !bricks.is_empty() {
             cluster.residency.pin(id, &bricks);
@@ -457,10 +454,10 @@ impl RegionFrame {
     }
 }
 
-/// Whether a worker may try a task that workers failed at or that is audited: the likeliest do. These are workers that
-/// have not failed at it, and of them those that have drawn something before, since anybody may call
-/// himself a new worker.
-fn may_try(cluster: &Cluster, task: &Task, id: WorkerId) -> bool {
+/// Whether a worker may try a task that workers failed at or that is audited: the likeliest do. These
+/// are workers that have not failed at it, and of them those that have drawn something before, since
+/// anybody may call himself a new worker.
+pub(super) fn may_try(cluster: &Cluster, task: &Task, id: WorkerId) -> bool {
     let rank = |w: &Worker| match task.was_failed_by(&w.identity) {
         true => 0,
         false => 1 + u32::from(w.reputation.has_drawn),
@@ -469,7 +466,8 @@ fn may_try(cluster: &Cluster, task: &Task, id: WorkerId) -> bool {
         // Who has voted has no other vote, nor has its neighbour if one from elsewhere is there.
         let may = |w: &Worker| !audit.has_vote_of(&w.identity);
         let is_far = |w: &Worker| w.is_trusted || audit.is_elsewhere(&w.identity);
-        let waits = || cluster.roster.active().any(|(_, other)| may(other) && is_far(other));
+        let is_better = |w: &Worker| may(w) && is_far(w) && !w.is_stuck;
+        let waits = || cluster.roster.active().any(|(_, other)| is_better(other));
         if !may(w) || !is_far(w) && waits() {
             return false;
         }

@@ -6,6 +6,7 @@
 //! behind it on the same worker. Its own lease stays live. The price is at most one task for each
 //! idle thread. Suspects are left out, lest they take two workers at once.
 
+use super::lend::may_try;
 use crate::Micros;
 use crate::state::cluster::Cluster;
 use crate::state::frame::FrameCore;
@@ -157,7 +158,10 @@ impl FrameCore {
             let task = queue.id(place);
             let has_it = |id: WorkerId| table.lent(id).iter().any(|l| l.task == task);
             let may = |id: WorkerId, load: u64| load == 0 || fits(id, place);
-            let takers = idle.iter().filter(|(id, load)| !has_it(*id) && may(*id, *load));
+            // Who has voted on an audited task has no second vote.
+            let may_vote = |id: WorkerId| may_try(cluster, &queue.tasks[place as usize], id);
+            let takers =
+                idle.iter().filter(|(id, load)| !has_it(*id) && may(*id, *load) && may_vote(*id));
             let Some(&(id, _)) = takers.min_by_key(|(_, load)| *load) else { continue };
             return match until > now {
                 true => Silent { copy: None, at: Some(until) },

@@ -10,10 +10,11 @@
 //! a result of an audited tile    is held, and the tile waits for another worker   (one vote)
 //! a second one                   equal: the tile is done; both have agreed
 //!                                not: a trusted worker's word counts, or a third decides
-//! nobody is there to compare     the tile is done, unaudited
+//! nobody is there to compare     the tile is done, unaudited (nor is who has drawn nothing for 5 s)
 //! ```
 //!
-//! A tile that is audited is never split, so that votes are of one rectangle. The price is a tile
+//! A tile that is audited is never split, so that votes are of one rectangle. Two votes of one
+//! worker count as one, whatever links they came by. The price is a tile
 //! drawn twice: sixteen for each new worker, a quarter of a frame, then one in a hundred.
 
 use crate::account::ledger::Rendered;
@@ -76,7 +77,8 @@ impl Audit {
         let is_same = |a: &Drawn, b: &Drawn| a.result.pixels == b.result.pixels;
         let trusted = votes.iter().position(|v| v.is_trusted);
         let pair = || {
-            let twice = |i: &usize| votes[i + 1..].iter().any(|v| is_same(v, &votes[*i]));
+            let agree = |a: &Drawn, b: &Drawn| a.who != b.who && is_same(a, b);
+            let twice = |i: &usize| votes[i + 1..].iter().any(|v| agree(v, &votes[*i]));
             (0..votes.len()).find(twice)
         };
         let truth = trusted.or_else(pair)?;
@@ -88,6 +90,12 @@ impl Audit {
         };
         let liars = others.iter().map(|v| (v.worker, v.who.clone())).collect();
         Some(Verdict { truth: self.votes.swap_remove(truth), agreed, liars })
+    }
+
+    /// Forgets the votes of a worker that drew false pixels elsewhere. Returns whether any is left.
+    pub(crate) fn forget(&mut self, who: &WorkerIdentity) -> bool {
+        self.votes.retain(|v| *v.who != *who);
+        !self.votes.is_empty()
     }
 
     /// Takes the only vote where nobody can add another.
@@ -131,6 +139,57 @@ pub(crate) fn is_in_share(seed: u64, task: u64, share_ppm: u32) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use slabcast_common::ids::TaskId;
+    use slabcast_common::image::TilePixels;
+    use slabcast_common::message::Pixels;
+
+    /// A result of one pixel by a stranger, over one of its links.
+    fn vote(link: u64, name: &str, opacity: f32) -> Drawn {
+        let pixels = TilePixels { a: vec![opacity], colour: vec![[0; 3]], last: None };
+        let result = TileResult {
+            task: TaskId(0),
+            epoch: Epoch(0),
+            pixels: Pixels::Sums(pixels),
+            bytes: None,
+            counters: Default::default(),
+            times: Default::default(),
+            region: None,
+        };
+        Drawn {
+            worker: WorkerId(link),
+            who: Arc::new(WorkerIdentity { host: "there".into(), name: name.into() }),
+            is_trusted: false,
+            name: name.into(),
+            thread: 0,
+            epoch: Epoch(0),
+            rendered: Rendered { start: 0, end: 1, p2p_us: 0 },
+            bricks_used: 0,
+            result: Box::new(result),
+        }
+    }
+
+    #[test]
+    fn votes_of_one_worker_count_once_on_whatever_links() {
+        let mut audit = Audit::default();
+        assert!(audit.add(vote(1, "liar", 0.5), 0).is_none());
+        assert!(audit.add(vote(1, "liar", 0.5), 1).is_none(), "a second result");
+        assert!(audit.add(vote(2, "liar", 0.5), 2).is_none(), "it dialled again");
+        assert!(audit.add(vote(3, "a", 0.25), 3).is_none());
+        let end = audit.add(vote(4, "b", 0.25), 4).expect("two that differ from it");
+        assert_eq!((end.truth.who.name.as_str(), end.agreed.len()), ("a", 2));
+        assert!(end.liars.iter().all(|(_, who)| who.name == "liar"));
+    }
+
+    #[test]
+    fn votes_of_a_worker_that_is_shut_out_are_forgotten() {
+        let mut audit = Audit::default();
+        audit.add(vote(1, "liar", 0.5), 0);
+        audit.add(vote(2, "a", 0.25), 1);
+        let who = |name: &str| WorkerIdentity { host: "there".into(), name: name.into() };
+        assert!(audit.forget(&who("liar")));
+        assert!(!audit.has_vote_of(&who("liar")) && audit.undecided(u64::MAX).is_none());
+        assert!(!audit.forget(&who("a")), "none is left");
+    }
 
     #[test]
     fn share_of_audited_tasks_is_as_asked_and_depends_on_the_seed() {

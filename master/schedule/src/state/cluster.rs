@@ -57,7 +57,7 @@ impl Cluster {
         let Config { audit_ppm, audit_first, audit_seed, .. } = self.config;
         let is_chosen =
             worker.reputation.agreed < audit_first || is_in_share(audit_seed, task, audit_ppm);
-        let is_other = |w: &Worker| !w.leaving && w.identity != worker.identity;
+        let is_other = |w: &Worker| !w.leaving && !w.is_stuck && w.identity != worker.identity;
         is_chosen && self.roster.iter().any(|(_, w)| is_other(w))
     }
 

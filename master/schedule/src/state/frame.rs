@@ -15,6 +15,8 @@
 //! silent (`workers`), which copy of a result counts (`task_queue`) and where bricks are
 //! (`residency`).
 
+mod second;
+
 use crate::account::critical_path::RenderedTile;
 use crate::account::ledger::{Ledger, Rendered, ms, place_in_time};
 use crate::account::spans;
@@ -29,9 +31,8 @@ use crate::state::residency::Transfer;
 use crate::state::result_checks::{check_cost, check_leaves, check_sums};
 use crate::state::slab_frame::SlabFrame;
 use crate::state::task_queue::{End, Task, Verdict};
-use crate::state::worker_map::WorkerMap;
 use crate::state::workers::Worker;
-use crate::{Action, Clock, FrameJob, Micros, Span};
+use crate::{Action, Clock, FrameJob, Micros, Span, WorkerIdentity};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
 use slabcast_common::image::{FrameState, PixelEncoding};
 use slabcast_common::message::{Pixels, RegionSplit, TileResult, ToWorker};
@@ -39,6 +40,7 @@ use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
 use slabcast_common::stats::{BrickStats, SlabStats, TileStats};
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 /// Whether a pixel with accumulated opacity `a` is shut for good.
 ///
@@ -110,8 +112,8 @@ pub(crate) struct FrameCore {
     relevant_voxels: u64,
     /// The first tile that was given up.
     given_up: Option<Box<GivenUp>>,
-    /// When each worker that is not trusted drew a tile last that nobody compared.
-    unaudited: WorkerMap<Micros>,
+    /// Workers that are not trusted and drew tiles that nobody compared.
+    unaudited: BTreeSet<Arc<WorkerIdentity>>,
     pub(crate) ledger: Ledger,
 }
 
@@ -178,7 +180,7 @@ impl FrameCore {
             brick_use: BrickUse::new(job.bricks.len()),
             relevant_voxels: cluster.residency.voxels(job.scene.bricks),
             given_up: None,
-            unaudited: WorkerMap::default(),
+            unaudited: BTreeSet::new(),
             ledger,
             job,
         }
@@ -273,9 +275,9 @@ impl FrameCore {
         Some(lent)
     }
 
-    /// Returns when a worker drew a tile last that nobody compared.
-    pub(crate) fn unaudited(&self, id: WorkerId) -> Option<Micros> {
-        self.unaudited.get(id).copied()
+    /// Whether a worker that is not trusted drew a tile that nobody compared, on any of its links.
+    pub(crate) fn has_unaudited(&self, who: &WorkerIdentity) -> bool {
+        self.unaudited.contains(who)
     }
 
     /// Returns the number of leases of a worker.
@@ -462,6 +464,7 @@ impl Frame {
             bricks_used: lent.map_or(0, |l| l.bricks.len()),
             result: Box::new(result),
         };
+        cluster.roster.answered(worker, now);
         let is_audited = core.table.queue.tasks[place as usize].is_audited();
         let Some(AuditEnd { truth, agreed, liars }) = core.table.queue.vote(place, drawn, now)
         else {
@@ -470,30 +473,17 @@ impl Frame {
         };
         for id in agreed {
             if let Some(worker) = cluster.roster.get_mut(id) {
-                worker.reputation.agree(now);
+                worker.reputation.agree();
             }
         }
         let frame = core.job.frame;
         let lies = liars.into_iter().map(|(worker, who)| Lie { worker, who, frame, tile });
         cluster.lies.extend(lies);
         if !is_audited && !truth.is_trusted {
-            core.unaudited.insert(worker, now);
+            core.unaudited.insert(truth.who.clone());
         }
         self.enter(cluster, place, truth, clock);
         Ok(Some((start, end)))
-    }
-
-    /// Has another worker draw a task whose result waits to be compared: a trusted one, or the one
-    /// with least to do.
-    fn find_second(&mut self, cluster: &Cluster, place: u32) {
-        let Some(region) = self.as_region_mut() else { return };
-        let Some(audit) = region.core.table.queue.tasks[place as usize].audit() else { return };
-        let others = cluster.roster.active().filter(|(_, w)| !audit.has_vote_of(&w.identity));
-        let key = |w: &Worker| (!w.is_trusted, !audit.is_elsewhere(&w.identity), w.leases);
-        let second = others.min_by_key(|(_, w)| key(w)).map(|(id, _)| id);
-        if let Some(id) = second {
-            region.tiles.give(place, id);
-        }
     }
 
     /// Enters the result of a task: its pixels, and its costs.
@@ -691,22 +681,7 @@ impl Frame {
         if core.stage != Stage::Drawing {
             return;
         }
-        let held: Vec<u32> = core.table.queue.held().collect();
-        for place in held {
-            let core = self.core_mut();
-            let Some(audit) = core.table.queue.tasks[place as usize].audit() else { continue };
-            let may = |w: &Worker| !w.leaving && !audit.has_vote_of(&w.identity);
-            if cluster.roster.iter().any(|(_, w)| may(w)) {
-                continue;
-            }
-            if let Some(names) = audit.undecided(now) {
-                let given_up = GivenUp::undecided(&core.table, place, slab, names);
-                core.given_up.get_or_insert(Box::new(given_up));
-            } else if let Some(drawn) = core.table.queue.take_sole_vote(place) {
-                core.unaudited.insert(drawn.worker, now);
-                self.enter(cluster, place, drawn, clock);
-            }
-        }
+        self.take_uncompared(cluster, clock);
         let core = self.core_mut();
         let troubled: Vec<u32> = core.table.queue.troubled().collect();
         for place in troubled {

@@ -26,9 +26,8 @@ pub(crate) struct Reputation {
     pub(crate) strikes: u32,
     /// Whether any result of it was accepted.
     pub(crate) has_drawn: bool,
-    /// Audits in which it drew what others drew, and the time of the last.
+    /// Audits in which it drew what others drew.
     pub(crate) agreed: u32,
-    pub(crate) agreed_at: Micros,
     seen: Micros,
 }
 
@@ -45,9 +44,8 @@ impl Reputation {
     }
 
     /// Counts an audit in which it drew what others drew.
-    pub(crate) fn agree(&mut self, now: Micros) {
+    pub(crate) fn agree(&mut self) {
         self.agreed = self.agreed.saturating_add(1);
-        self.agreed_at = now;
         self.add_result();
     }
 

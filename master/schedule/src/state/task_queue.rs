@@ -115,6 +115,11 @@ impl Task {
         self.blamed > 0
     }
 
+    /// Whether a worker's lease of it still runs; `None` if the worker has none.
+    pub(crate) fn expects(&self, worker: WorkerId) -> Option<bool> {
+        self.leases.iter().find(|l| l.worker == worker).map(|l| l.deadline.is_some())
+    }
+
     /// Whether two workers draw it.
     pub(crate) fn is_audited(&self) -> bool {
         self.audit.is_some()
@@ -484,6 +489,12 @@ impl TaskQueue {
         self.tasks[place as usize].audit = Some(Audit::default());
     }
 
+    /// Forgets the votes of a worker that drew false pixels.
+    pub(crate) fn forget_votes(&mut self, who: &WorkerIdentity) {
+        let tasks = &mut self.tasks;
+        self.held.retain(|p| tasks[*p as usize].audit.as_mut().is_some_and(|a| a.forget(who)));
+    }
+
     /// Takes a result of a task. One that is not audited, or whose audit it ends, is done with the
     /// verdict; else it waits for another worker.
     pub(crate) fn vote(&mut self, place: u32, drawn: Drawn, now: Micros) -> Option<AuditEnd> {
@@ -501,10 +512,9 @@ impl TaskQueue {
         end
     }
 
-    /// Returns the open tasks whose results wait to be compared and that nobody has now.
+    /// Returns the open tasks whose results wait to be compared.
     pub(crate) fn held(&self) -> impl Iterator<Item = u32> {
-        let is_free = |place: &u32| self.tasks[*place as usize].leases.is_empty();
-        self.held.iter().copied().filter(is_free)
+        self.held.iter().copied()
     }
 
     /// Takes the only result of a task that nobody can compare.

@@ -38,6 +38,10 @@ const DRIFT: f64 = 100e-6;
 /// quarter of an hour; a worker that owes more will not answer the oldest.
 const MAX_PINGS: usize = 1024;
 
+/// Limit: time in microseconds with leases and without a result after which audits no longer wait for
+/// a worker. Tiles take milliseconds; a worker that answers pings alone would hold up frames.
+const STUCK_US: Micros = 5_000_000;
+
 /// Limit: lanes of workers that render overlapping frames in turn.
 pub(crate) const LANES: u32 = 2;
 
@@ -84,6 +88,10 @@ pub(crate) struct Worker {
     /// When it was pinged last, and since when it has leases.
     pinged: Micros,
     busy_since: Micros,
+    /// When its last result came.
+    answered: Micros,
+    /// Whether it had leases for [`STUCK_US`] and returned no result since: audits don't wait for it.
+    pub(crate) is_stuck: bool,
     /// Whether the worker has leases and sent nothing for `Config::unresponsive_after`. It is lent nothing
     /// then, and other workers may be lent its tasks.
     is_unresponsive: bool,
@@ -231,6 +239,8 @@ impl Roster {
             next_ping: now,
             pinged: now,
             busy_since: now,
+            answered: now,
+            is_stuck: false,
             is_unresponsive: false,
             pings: VecDeque::new(),
             offset: None,
@@ -342,6 +352,20 @@ impl Roster {
         w.leases += 1;
         self.quiet_until = self.quiet_until.min(w.ping_due(config));
         self.idle -= usize::from(before && !w.has_idle_thread());
+    }
+
+    /// Notes that a result of a worker came.
+    pub(crate) fn answered(&mut self, id: WorkerId, now: Micros) {
+        let Some(w) = self.workers.get_mut(id) else { return };
+        w.answered = now;
+        w.is_stuck = false;
+    }
+
+    /// Marks the workers that answer pings and draw nothing.
+    pub(crate) fn mark_stuck(&mut self, now: Micros) {
+        for (_, w) in self.workers.iter_mut().filter(|(_, w)| w.leases > 0) {
+            w.is_stuck |= now >= w.busy_since.max(w.answered).saturating_add(STUCK_US);
+        }
     }
 
     /// Counts `leases` as ended.

@@ -43,6 +43,30 @@ fn worker_that_lies_in_all_its_tiles_is_shut_out_within_its_first_frame() {
     }
 }
 
+/// Answers a hundred times as fast as the others, so that they look silent and it is lent copies of
+/// their tasks, of its own audited ones too.
+#[test]
+fn liar_that_answers_at_once_votes_once_and_is_the_only_one_shut_out() {
+    let fast = || WorkerProfile { time_factor: 0.005, ..stranger(1) };
+    let slow = |w: WorkerProfile| WorkerProfile { time_factor: 10.0, ..w };
+    // Beside a trusted worker, and beside two and three strangers that are honest.
+    for (schedule, strangers) in BOTH.into_iter().flat_map(|s| [0, 2, 3].map(|n| (s, n))) {
+        let mut w = world();
+        if strangers == 0 {
+            w.add_worker(slow(typical()));
+        }
+        for _ in 0..strangers {
+            w.add_worker(slow(stranger(0)));
+        }
+        let liar = w.add_worker(fast());
+        draw(&mut w, 0..3, schedule);
+        assert_eq!(w.observer.audit.shut_out, [liar], "{schedule:?} {strangers}");
+        // Compares all pictures with those of one thread.
+        w.finish();
+        assert_eq!(w.observer.done.len(), 3);
+    }
+}
+
 #[test]
 fn worker_that_lies_now_and_then_is_found_by_the_share() {
     // It is honest while it is new, and then lies in every tile.
@@ -106,6 +130,22 @@ fn result_that_waits_for_a_second_worker_counts_when_that_one_is_gone() {
         w.kill(other);
         w.finish();
         assert_eq!(w.observer.done.len(), 1);
+    }
+}
+
+#[test]
+fn stranger_that_answers_pings_and_draws_nothing_delays_one_frame_by_seconds() {
+    for schedule in BOTH {
+        let mut w = world();
+        w.add_worker(stranger(0));
+        w.add_worker(WorkerProfile { time_factor: 1e9, ..stranger(0) });
+        w.add_frame(job_by(0, schedule));
+        w.run_for(6_000_000);
+        assert_eq!(w.observer.done.len(), 1, "{schedule:?}");
+        w.add_frame(job_by(1, schedule));
+        w.run_for(1_000_000);
+        assert_eq!(w.observer.done.len(), 2, "{schedule:?}: it is not waited for again");
+        w.finish();
     }
 }
 

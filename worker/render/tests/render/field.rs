@@ -10,6 +10,7 @@ use slabcast_common::transfer::OpacityUnit;
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, SampleKind, Samples, Volume};
 use slabcast_render::judge::reference::FieldReference;
+use slabcast_render::oracle::explain_field::explain_field;
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
@@ -72,6 +73,52 @@ fn constant_volume_is_drawn_at_full_strength_up_to_its_faces() {
             assert!(off < 0.5, "{sums:?}, {thickness}, {crop:?}: {x},{y} has {got}, want {want}");
         }
     }
+}
+
+/// Inside a constant volume the field has no gradient, whichever way the lattice is turned: the sum of
+/// weights is known to waves of (3, 2) and (4, 2) cycles, whose slopes would light flat tissue.
+/// Thin planes and large pixels per vox make the rounding of positions small.
+#[test]
+fn constant_volume_turned_by_thirty_degrees_has_no_gradient() {
+    let n = 16u32;
+    let volume = Volume::from_fn_u8("constant", [n; 3], |i, j, k| match [i, j, k] {
+        [0, 0, 0] => 20,
+        _ => 200,
+    });
+    let white = vec![[0.0, 1.0, 1.0, 1.0], [255.0, 1.0, 1.0, 1.0]];
+    let visible = vec![[0.0, 0.0], [100.0, 0.0], [101.0, 0.01], [255.0, 0.01]];
+    let quality = Quality { eps: 0.0, sums: Sums::I32, thickness: 0.0625, ..Quality::default() };
+    let spec = SceneSpec {
+        id: SceneId(1),
+        volume: volume.info(Digest32::default()),
+        transfer: transfer(white, visible, OpacityUnit::AlphaPerVox),
+        quality,
+        crop: None,
+        bricks: Default::default(),
+    };
+    let camera = Camera {
+        to_eye: DVec3::new(0.5, 0.0, 0.75f64.sqrt()),
+        up: DVec3::Y,
+        target: DVec3::ZERO,
+        projection: CameraProjection::Ortho { height: f64::from(n) },
+    };
+    // 32 pixels a vox: positions are rounded to 1/8192 vox.
+    let size = 32 * n;
+    let view = View::new(&volume.lattice, &camera, [size; 2], &quality).expect("a camera");
+    let frame = Frame::new(Arc::new(Scene::new(&spec)), view);
+    let bricks = bricks_of(&volume);
+    let (mut looked_at, mut steepest) = (0, 0.0f64);
+    for x in [0, 13].map(|x| size / 2 + x) {
+        let explained = explain_field(&frame, &bricks, [x, size / 2 + 5], 0);
+        for plane in explained.planes.iter().filter(|plane| plane.depth.abs() < 3.0) {
+            looked_at += 1;
+            steepest = steepest.max(plane.gradient);
+            assert!((plane.code - 200.0).abs() < 0.1, "{x}, {}: {}", plane.depth, plane.code);
+        }
+    }
+    // Without waves of more than two cycles it is 0.61 codes per vox.
+    assert!(steepest < 0.15, "{steepest}");
+    assert_eq!(looked_at, 2 * 96);
 }
 
 /// Waves between 18 and 238 on an oblique lattice.

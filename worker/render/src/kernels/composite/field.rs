@@ -38,9 +38,14 @@ const STEPS: [f32; 3] = [100.0, 8000.0, 2.0];
 /// would light flat tissue.
 pub const FLAT_GRADIENT: f64 = 1.0 / 1020.0;
 
-/// Amplitude below which a wave of the sum of weights is left out. Its slope is then at most a
-/// hundredth of a code per vox where values are 50 codes from the background.
+/// Amplitude times cycles per lattice step below which a wave of the sum of weights is left out. Its
+/// slope is then at most a fiftieth of a code per step where values are 100 codes from the background.
 const FAINT_WAVE: f64 = 3e-5;
+
+/// Most cycles per step, along each index axis, of a wave that is divided out. Seen from 30 degrees
+/// aside, waves of (3, 2) and (4, 2) cycles have slopes of 0.2 and 0.1 codes per step where values are
+/// 110 codes from the background: as much as [`FLAT_GRADIENT`] of an 8-bit volume.
+const WAVE_CYCLES: i32 = 5;
 
 /// Weight of the kernel inside the volume below which a value is not divided by it.
 const LEAST_WEIGHT: f32 = 0.25;
@@ -84,14 +89,16 @@ impl Wave {
         let frequencies = own_from_index.inverse().transpose();
         let index_from_eye = view.eye_from_index.inverse();
         let mut waves = Vec::new();
-        for n in 63..125 {
-            // One of each pair of opposite points up to two cycles a step.
-            let cycles =
-                DVec3::new(f64::from(n % 5 - 2), f64::from(n / 5 % 5 - 2), f64::from(n / 25 - 2));
+        let edge = 2 * WAVE_CYCLES + 1;
+        let all = edge * edge * edge;
+        for n in all / 2 + 1..all {
+            // One of each pair of opposite points.
+            let cycles = [n % edge, n / edge % edge, n / edge / edge];
+            let cycles = DVec3::from_array(cycles.map(|c| f64::from(c - WAVE_CYCLES)));
             let frequency = frequencies * cycles;
             let transform: f64 =
                 frequency.to_array().iter().map(|&f| profile.transform_at(f)).product();
-            if 2.0 * transform.abs() < FAINT_WAVE {
+            if 2.0 * transform.abs() * frequency.length() < FAINT_WAVE {
                 continue;
             }
             let along = index_from_eye.transpose() * cycles;

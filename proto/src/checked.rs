@@ -6,7 +6,7 @@
 //!
 //! A message whose checksum is false is DATA_LOSS: whoever sent it sends it again. The field comes
 //! first, since it can't be told from payload at the end. A message whose first two bytes differ
-//! from [`MARK`] in one bit has the field, damaged; no message of `render.proto` begins so.
+//! from field 2047 in one bit has the field, damaged; no message of `render.proto` begins so.
 
 use bytes::{Buf, BufMut, Bytes};
 use prost::Message;

@@ -276,7 +276,8 @@ impl FrameStream {
             })
     }
 
-    /// Watches from the first frame that is not whole.
+    /// Watches from the first frame that is not whole. Leaves no stream if the request was damaged on
+    /// its way.
     async fn reopen(&mut self) -> Result<(), ClientError> {
         self.partial = None;
         let (job_id, from_frame) = (self.job.clone(), self.next);
@@ -284,9 +285,14 @@ impl FrameStream {
         let mut render = self.client.render.clone();
         // Not the call's own deadline: that would end the stream, too.
         let stream = match tokio::time::timeout(ANSWER, render.watch_frames(request)).await {
-            Ok(stream) => stream
-                .map_err(|status| ClientError::from_status(self.client.address(), &status))?
-                .into_inner(),
+            Ok(Ok(stream)) => stream.into_inner(),
+            // The request arrived damaged: no reason to wait, and no stream yet.
+            Ok(Err(status)) if status.code() == Code::DataLoss => {
+                return self.damaged(status.message()).map(drop);
+            }
+            Ok(Err(status)) => {
+                return Err(ClientError::from_status(self.client.address(), &status));
+            }
             Err(_) => return Err(self.lost(format!("no answer in {} s", ANSWER.as_secs()))),
         };
         self.stream = Some(Open { chunks: stream, since: Instant::now(), waiting_since: None });

@@ -61,6 +61,8 @@ mod sketch;
 mod source;
 mod store;
 mod tiff_stack;
+#[cfg(feature = "zarr")]
+mod units;
 mod unpack;
 mod vti;
 mod wide;

@@ -43,6 +43,8 @@ pub(super) struct Array {
     /// The array's path in it.
     folder: String,
     pub(super) shape: Vec<u64>,
+    /// Names of the axes, if the array gives one for each; an axis without a name has an empty one.
+    pub(super) names: Option<Vec<String>>,
     /// Shape of a chunk file, which holds one chunk or a shard.
     grid: Vec<u64>,
     pub(super) number: Number,
@@ -133,6 +135,10 @@ impl Array {
             root: root.clone(),
             folder: folder.into(),
             shape: meta.required("shape")?.sizes()?,
+            names: names(meta.get("dimension_names")).or_else(|| {
+                let attributes = meta.get("attributes")?;
+                names(attributes.get("_ARRAY_DIMENSIONS"))
+            }),
             grid,
             number,
             endian: codecs.endian,
@@ -163,10 +169,14 @@ impl Array {
         };
         let grid = meta.required("chunks")?.sizes()?;
         let codecs = Codecs::version_2(meta, endian, grid.len())?;
+        // xarray writes the names beside the array.
+        let attributes = root.has(&json::path(folder, ".zattrs"));
+        let attributes = attributes.then(|| Json::read(root, folder, ".zattrs")).transpose()?;
         Ok(Array {
             root: root.clone(),
             folder: folder.into(),
             shape: meta.required("shape")?.sizes()?,
+            names: attributes.and_then(|a| names(a.get("_ARRAY_DIMENSIONS"))),
             grid,
             number,
             endian,
@@ -484,6 +494,13 @@ impl ChunkKey {
         let prefix = (!self.prefix.is_empty()).then(|| self.prefix.to_string());
         prefix.into_iter().chain(numbers).collect::<Vec<_>>().join(&self.separator.to_string())
     }
+}
+
+/// Returns the names of axes in a list of texts and nulls.
+fn names(list: Option<Json>) -> Option<Vec<String>> {
+    let list = list?;
+    let list = list.value.as_array()?;
+    Some(list.iter().map(|n| n.as_str().unwrap_or_default().to_string()).collect())
 }
 
 fn separator(asked: Option<Json>, usual: char) -> Result<char, Problem> {

@@ -105,9 +105,14 @@ fn unshuffle(plain: &[u8], size: usize, out: &mut Vec<u8>) {
     out.extend(&plain[n * size..]);
 }
 
-/// Undoes the bit shuffle of a multiple of eight numbers. Bytes left over are not shuffled.
+/// Undoes the bit shuffle of a block. c-blosc 1 leaves a block as it is whose numbers are no
+/// multiple of eight (c-blosc issue 240). Bytes beyond the last number are not shuffled.
 fn unshuffle_bits(plain: &[u8], size: usize, out: &mut Vec<u8>) {
-    let n = plain.len() / size / 8 * 8;
+    let n = plain.len() / size;
+    if !n.is_multiple_of(8) {
+        out.extend_from_slice(plain);
+        return;
+    }
     let start = out.len();
     out.resize(start + n * size, 0);
     let to = &mut out[start..];
@@ -181,9 +186,9 @@ mod tests {
     }
 
     #[test]
-    fn blosc_undoes_the_bit_shuffle() {
-        let plain: Vec<u8> = (0..34u8).map(|i| i.wrapping_mul(37)).collect();
-        // 17 numbers of two bytes: 16 are shuffled, one is left over.
+    fn blosc_undoes_the_bit_shuffle_of_blocks_of_a_multiple_of_eight_numbers() {
+        let plain: Vec<u8> = (0..33u8).map(|i| i.wrapping_mul(37)).collect();
+        // 16 numbers of two bytes, and a byte left over.
         let mut bits = vec![0u8; 32];
         for row in 0..16 {
             for i in 0..16 {
@@ -195,5 +200,14 @@ mod tests {
         let mut out = Vec::new();
         unshuffle_bits(&bits, 2, &mut out);
         assert_eq!(out, plain);
+        // 315 voxels of uint8, as zarr-python packs them: c-blosc left the block as it was.
+        let plain: Vec<u8> = (0..315u32).map(|i| (i * 7 % 251) as u8).collect();
+        let blosc = container(4 | 0x10 | 1 << 5, 1, 315, 315, &[part(&plain)]);
+        assert_eq!(decode(&blosc, 315).unwrap(), plain);
+        // A whole block of 16 numbers, and one of 9 that is left as it is.
+        let shuffled = [0xff, 0xff].into_iter().chain([0; 14]).collect::<Vec<u8>>();
+        let last: Vec<u8> = (1..10).collect();
+        let blosc = container(4 | 0x10 | 1 << 5, 1, 25, 16, &[part(&shuffled), part(&last)]);
+        assert_eq!(decode(&blosc, 25).unwrap(), [vec![1; 16], last].concat());
     }
 }

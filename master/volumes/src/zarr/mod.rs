@@ -16,6 +16,7 @@ mod json;
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::limit::{ByteCap, free_memory};
 use crate::source::Folder;
+use crate::units::{Step, steps_in_mm};
 use crate::{Hints, Opened};
 use array::Array;
 use json::{Json, path};
@@ -170,11 +171,24 @@ pub(crate) struct Placed {
 }
 
 impl Placed {
-    /// Places an array without metadata: its last three axes are z, y, x.
+    /// Places an array by the names of its axes. Without names, its last three axes are z, y, x.
     fn without_metadata(array: &Array) -> Result<Placed, Problem> {
         let rank = array.shape.len();
-        let axes = [1, 2, 3].map(|back| rank.checked_sub(back));
-        Placed::new(array, axes, [1.0; 3], [0.0; 3], |_| None)
+        let names = array.names.clone().filter(|names| names.len() == rank).unwrap_or_default();
+        let axes = match space(&names) {
+            Some(axes) => axes,
+            None => unnamed_space(array, &names),
+        };
+        let mut placed = Placed::new(array, axes, [1.0; 3], [0.0; 3], |a| {
+            names.get(a).filter(|n| !n.is_empty()).map(|n| quoted(n))
+        })?;
+        let named = names.iter().any(|n| !n.is_empty());
+        if named && space(&names).is_none() {
+            let shown = axes.map(|a| a.map_or("none".into(), |a| quoted(&names[a])));
+            let [x, y, z] = shown;
+            placed.notes.push(format!("the axes x, y, z were taken to be {x}, {y}, {z}"));
+        }
+        Ok(placed)
     }
 
     fn new(
@@ -203,22 +217,40 @@ impl Placed {
     }
 }
 
+/// Returns the axes that are called x, y and z; `None` without an x and a y.
+fn space(names: &[String]) -> Option<[Option<usize>; 3]> {
+    let called = |name: &str| names.iter().position(|n| n.eq_ignore_ascii_case(name));
+    let axes = ["x", "y", "z"].map(called);
+    (axes[0].is_some() && axes[1].is_some()).then_some(axes)
+}
+
+/// Returns the axes that are x, y and z of an array in which they are not called so: the last three
+/// that are not a channel or a time by name.
+fn unnamed_space(array: &Array, names: &[String]) -> [Option<usize>; 3] {
+    const OTHER: [&str; 10] =
+        ["c", "ch", "channel", "channels", "t", "time", "times", "band", "sample", "component"];
+    let is_space = |a: &usize| {
+        names.get(*a).is_none_or(|n| !OTHER.iter().any(|other| n.eq_ignore_ascii_case(other)))
+    };
+    let mut axes = (0..array.shape.len()).rev().filter(is_space);
+    [axes.next(), axes.next(), axes.next()]
+}
+
 /// Names and units of a picture's axes.
 struct Axes {
     names: Vec<String>,
-    /// Millimetres of an axis's unit.
-    mm: Vec<f64>,
+    units: Vec<Option<String>>,
 }
 
 impl Axes {
     fn from_image(image: &Json) -> Result<Axes, Problem> {
-        let mut axes = Axes { names: Vec::new(), mm: Vec::new() };
+        let mut axes = Axes { names: Vec::new(), units: Vec::new() };
         let list = image.get("axes");
         let count = list.as_ref().map_or(0, Json::len);
         // Before version 0.4 axes were plain names, and before 0.3 always these five.
         if count == 0 {
             axes.names = ["t", "c", "z", "y", "x"].map(String::from).to_vec();
-            axes.mm = vec![1.0; 5];
+            axes.units = vec![None; 5];
         }
         for i in 0..count {
             let axis = list.as_ref().expect("it has entries").entry(i);
@@ -230,13 +262,7 @@ impl Axes {
                 ),
             };
             axes.names.push(name.to_lowercase());
-            axes.mm.push(match unit.as_deref() {
-                Some("meter") => 1000.0,
-                Some("centimeter") => 10.0,
-                Some("micrometer") => 1e-3,
-                Some("nanometer") => 1e-6,
-                _ => 1.0,
-            });
+            axes.units.push(unit);
         }
         Ok(axes)
     }
@@ -251,14 +277,13 @@ impl Axes {
                 "correct the picture's metadata",
             ));
         }
-        let axes = ["x", "y", "z"].map(|name| self.names.iter().position(|n| n == name));
-        if axes[0].is_none() || axes[1].is_none() {
+        let Some(axes) = space(&self.names) else {
             return Err(Problem::unsupported(
                 "axes",
                 format!("{} has no x and y", quoted(&self.names.join(", "))),
                 "give the folder of an array",
             ));
-        }
+        };
         let (mut scale, mut shift) = (vec![1.0; rank], vec![0.0; rank]);
         for owner in [dataset, image] {
             let Some(list) = owner.get("coordinateTransformations") else { continue };
@@ -276,11 +301,17 @@ impl Axes {
                 }
             }
         }
-        let in_mm =
-            |list: &[f64], default: f64| axes.map(|a| a.map_or(default, |a| list[a] * self.mm[a]));
-        Placed::new(array, axes, in_mm(&scale, 1.0), in_mm(&shift, 0.0), |a| {
-            self.names.get(a).map(|n| quoted(n))
-        })
+        let mut notes = Vec::new();
+        let steps = axes.map(|a| Step {
+            number: a.map(|a| scale[a]),
+            unit: a.and_then(|a| self.units[a].clone()),
+        });
+        let (spacing, mm) = steps_in_mm(&steps, &mut notes);
+        let origin = [0, 1, 2].map(|i| axes[i].map_or(0.0, |a| shift[a] * mm[i]));
+        let mut placed =
+            Placed::new(array, axes, spacing, origin, |a| self.names.get(a).map(|n| quoted(n)))?;
+        placed.notes.extend(notes);
+        Ok(placed)
     }
 }
 

@@ -414,3 +414,101 @@ fn zarr_links_out_of_the_folder_are_refused_whatever_they_lead_to() {
     symlink(&to, &from).unwrap();
     assert_eq!(values(&crate::open(&folder).unwrap()), (0..60).collect::<Vec<i16>>());
 }
+
+/// A picture of version 0.4 with an array of uint8 of one value.
+fn picture(folder: &Path, shape: &[u64], axes: serde_json::Value, scale: serde_json::Value) {
+    let meta = json!({
+        "zarr_format": 2, "shape": shape, "chunks": vec![8; shape.len()], "dtype": "|u1",
+        "compressor": null, "fill_value": 1, "filters": null, "order": "C",
+    });
+    put(folder, "0/.zarray", meta.to_string().as_bytes());
+    let attributes = json!({"multiscales": [{"version": "0.4", "axes": axes, "datasets": [
+        {"path": "0", "coordinateTransformations": [{"type": "scale", "scale": scale}]}]}]});
+    put(folder, ".zattrs", attributes.to_string().as_bytes());
+    put(folder, ".zgroup", b"{\"zarr_format\":2}");
+}
+
+#[test]
+fn ome_zarr_axes_without_unit_or_z_take_those_of_x_and_say_so() {
+    let um = |name: &str| json!({"name": name, "type": "space", "unit": "micrometer"});
+    let with = |unit: &str| json!({"name": "z", "type": "space", "unit": unit});
+    let bare = |name: &str| json!({"name": name, "type": "space"});
+    for (axes, scale, want, say) in [
+        (json!([bare("z"), um("y"), um("x")]), json!([0.5, 0.5, 0.5]), [0.5e-3; 3], "no unit"),
+        (json!([um("y"), um("x")]), json!([0.5, 0.5]), [0.5e-3; 3], "not say the step along z"),
+        (
+            json!([with("furlong"), um("y"), um("x")]),
+            json!([2, 1, 1]),
+            [1e-3, 1e-3, 2e-3],
+            "the unit `furlong`",
+        ),
+        (json!([with("angstrom"), um("y"), um("x")]), json!([2e4, 1, 1]), [1e-3, 1e-3, 2e-3], ""),
+        (json!([with("decimeter"), um("y"), um("x")]), json!([2e-5, 1, 1]), [1e-3, 1e-3, 2e-3], ""),
+        (
+            json!([bare("z"), bare("y"), bare("x")]),
+            json!([3, 2, 2]),
+            [2.0, 2.0, 3.0],
+            "along x, y, z has no unit; mm were taken",
+        ),
+        (json!([bare("z"), bare("y"), bare("x")]), json!([1, 1, 1]), [1.0; 3], ""),
+    ] {
+        let dir = tempfile::tempdir().unwrap();
+        let shape = [4, 4, 4];
+        picture(dir.path(), &shape[..axes.as_array().unwrap().len()], axes.clone(), scale);
+        let opened = crate::open_with(dir.path(), &Hints::default()).unwrap();
+        let got = opened.volume.lattice.spacing();
+        assert!((0..3).all(|a| (got[a] / want[a] - 1.0).abs() < 1e-12), "{axes}: {got:?}");
+        let notes = opened.notes.join("\n");
+        assert!(notes.contains(say) && notes.is_empty() == say.is_empty(), "{axes}: {notes}");
+    }
+}
+
+/// Opens an array of int16 0, 1, 2, ... in the order of its axes, and returns its volume and notes.
+fn named(shape: &[u64], names: serde_json::Value, version: u64) -> (Volume, String) {
+    let dir = tempfile::tempdir().unwrap();
+    let count = shape.iter().product::<u64>() as i16;
+    let bytes: Vec<u8> = (0..count).flat_map(i16::to_le_bytes).collect();
+    if version == 2 {
+        let meta = json!({
+            "zarr_format": 2, "shape": shape, "chunks": shape, "dtype": "<i2",
+            "compressor": null, "fill_value": 0, "filters": null, "order": "C",
+        });
+        put(dir.path(), ".zarray", meta.to_string().as_bytes());
+        let attributes = json!({"_ARRAY_DIMENSIONS": names});
+        put(dir.path(), ".zattrs", attributes.to_string().as_bytes());
+        put(dir.path(), &vec!["0"; shape.len()].join("."), &bytes);
+    } else {
+        let codecs = json!([{"name": "bytes", "configuration": {"endian": "little"}}]);
+        let mut meta = meta_3(codecs, [1; 3]);
+        meta["shape"] = json!(shape);
+        meta["chunk_grid"]["configuration"]["chunk_shape"] = json!(shape);
+        meta["dimension_names"] = names;
+        put(dir.path(), "zarr.json", meta.to_string().as_bytes());
+        put(dir.path(), &format!("c/{}", vec!["0"; shape.len()].join("/")), &bytes);
+    }
+    let opened = crate::open_with(dir.path(), &Hints::default()).unwrap();
+    (opened.volume, opened.notes.join("\n"))
+}
+
+#[test]
+fn zarr_axes_go_by_their_names_in_any_order() {
+    for version in [2, 3] {
+        let (v, notes) = named(&[4, 3, 2], json!(["x", "y", "z"]), version);
+        assert_eq!((v.lattice.dims, notes.as_str()), ([4, 3, 2], ""));
+        // x steps over 6 numbers, y over 2, z over 1.
+        assert_eq!(values(&v)[..6], [0, 6, 12, 18, 2, 8]);
+        assert_eq!(values(&v)[12], 1);
+        let (v, notes) = named(&[2, 3, 4, 5], json!(["z", "y", "x", "c"]), version);
+        assert_eq!(v.lattice.dims, [4, 3, 2]);
+        assert_eq!(values(&v)[..5], [0, 5, 10, 15, 20]);
+        assert!(notes.contains("the first of 5 along `c` was read"), "{notes}");
+        let (v, _) = named(&[2, 3, 4], json!(["Z", "Y", "X"]), version);
+        assert_eq!(v.lattice.dims, [4, 3, 2]);
+        // A channel that is called so is no axis of space, whatever the others are called.
+        let (v, notes) = named(&[2, 3, 4, 5], json!(["plane", "row", "col", "channel"]), version);
+        assert_eq!(v.lattice.dims, [4, 3, 2]);
+        assert!(notes.contains("taken to be `col`, `row`, `plane`"), "{notes}");
+        let (v, notes) = named(&[2, 3, 4], json!([null, null, null]), version);
+        assert_eq!((v.lattice.dims, notes.as_str()), ([4, 3, 2], ""));
+    }
+}

@@ -284,6 +284,37 @@ async fn watched(seed: u64, flips: u64, one_in: u64) {
     world.stop.send_replace(true);
 }
 
+/// A stream that is dropped with data on its way gives its share of the connection's window back: a
+/// connection that leaked some at each would stand still after a few megabytes.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn frames_that_come_damaged_again_and_again_leave_their_connection_whole() {
+    let truths = truths().await;
+    let mut world = World::new().await;
+    let down = Noise::new(6, 3, u64::MAX, Place::Messages);
+    let proxy = Proxy::start(world.address.clone(), (Noise::none(), down.clone()), NONE).await;
+    world.dial("quiet", &world.address);
+    let client = Client::connect(&proxy.address).await.expect("it listens");
+    let job = client.submit(&world.request()).await.expect("a good request");
+    let mut damaged = 0;
+    while damaged < 300 {
+        let got = tokio::time::timeout(PATIENT, async {
+            let mut frames = client.follow(&job, 0, PATIENCE).await.expect("it is there");
+            let mut got = Vec::new();
+            while let Some(update) = frames.next().await.expect("a frame in the end") {
+                if let Update::Frame(frame) = update {
+                    got.push(frame.stats.pixels_sha256);
+                }
+            }
+            damaged += frames.damaged_messages();
+            got
+        });
+        let got = got.await.unwrap_or_else(|_| panic!("stands still after {damaged} messages"));
+        assert_eq!(got, truths[0]);
+    }
+    assert_eq!(proxy.connections.load(Relaxed), 1);
+    world.stop.send_replace(true);
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn flipped_bits_between_a_client_and_its_master_change_no_picture() {
     watched(4, 60, 6).await;

@@ -2,7 +2,10 @@
 
 use crate::ClientError;
 
-/// Returns the `host:port` of an address that may begin with `http://`.
+/// Port of a master where an address names none.
+pub const DEFAULT_PORT: u16 = 7433;
+
+/// Returns the `host:port` of an address that may begin with `http://` and may have no port.
 pub(crate) fn authority(address: &str) -> Result<String, ClientError> {
     let wrong =
         |problem: &'static str| Err(ClientError::Address { address: address.to_owned(), problem });
@@ -12,8 +15,11 @@ pub(crate) fn authority(address: &str) -> Result<String, ClientError> {
     }
     let rest = rest.strip_prefix("http://").unwrap_or(rest);
     let rest = rest.strip_suffix('/').unwrap_or(rest);
-    let Some((host, port)) = rest.rsplit_once(':') else {
-        return wrong("has no port; give host:port");
+    let default_port = DEFAULT_PORT.to_string();
+    let is_host_alone = rest.ends_with(']') || !rest.contains(':');
+    let (host, port) = match rest.rsplit_once(':') {
+        Some((host, port)) if !is_host_alone => (host, port),
+        _ => (rest, default_port.as_str()),
     };
     if !matches!(port.parse::<u16>(), Ok(1..)) {
         return wrong("has no port that can be called; give host:port with 1 to 65535");
@@ -27,7 +33,7 @@ pub(crate) fn authority(address: &str) -> Result<String, ClientError> {
     if !ok {
         return wrong("is not host:port; write IPv6 as [::1]:port");
     }
-    Ok(rest.to_owned())
+    Ok(format!("{host}:{port}"))
 }
 
 #[cfg(test)]
@@ -40,18 +46,20 @@ mod tests {
             ("localhost:7070", "localhost:7070"),
             (" http://10.0.0.7:1/ ", "10.0.0.7:1"),
             ("[::1]:7070", "[::1]:7070"),
+            ("localhost", "localhost:7433"),
+            ("[::1]", "[::1]:7433"),
             ("render_node-3.lan:65535", "render_node-3.lan:65535"),
         ] {
             assert_eq!(authority(written).unwrap(), meant);
         }
         for written in [
             "",
-            "localhost",
             "localhost:",
             "localhost:0",
             "localhost:99999",
             "https://a:1",
             "::1:70",
+            "::1",
             "a b:1",
             "u@h:1",
             "http://h:1/path",

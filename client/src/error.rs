@@ -27,6 +27,17 @@ pub enum ClientError {
         /// Text of the system's error.
         cause: String,
     },
+    /// Something answers at the address, or holds its port, that is no master.
+    #[error(
+        "no slabcast master at {address} ({problem}): check host and port; a master says at its start \
+         where it listens, and no HTTP proxy may stand between"
+    )]
+    NotAMaster {
+        /// The address that was called.
+        address: String,
+        /// Problem, for people.
+        problem: String,
+    },
     /// The connection broke, or the master is ending or starting.
     #[error("lost the master at {address} ({cause}): the job goes on; call again")]
     Lost {

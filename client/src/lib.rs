@@ -30,6 +30,7 @@ mod address;
 mod error;
 mod frames;
 
+pub use address::DEFAULT_PORT;
 pub use error::ClientError;
 pub use frames::{FrameStream, PATIENCE, ReceivedFrame, Update};
 pub use slabcast_proto::convert::local_field;
@@ -42,6 +43,7 @@ use slabcast_proto::render_v1::{self as wire, render_service_client::RenderServi
 use slabcast_proto::{MAX_RENDER_MESSAGE, convert};
 use slabcast_scene::path::Framing;
 use slabcast_scene::request::PathRequest;
+use std::error::Error as _;
 use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
@@ -87,10 +89,11 @@ pub struct Submitted {
 }
 
 impl Client {
-    /// Connects to the master at `host:port` (or `http://host:port`).
+    /// Connects to the master at `host:port`, `host` ([`DEFAULT_PORT`]) or `http://host:port`.
     ///
     /// # Errors
-    /// [`ClientError::Address`] and [`ClientError::Connect`] name the address and what to do.
+    /// [`ClientError::Address`], [`ClientError::Connect`] and, if what answers is no master,
+    /// [`ClientError::NotAMaster`] name the address and what to do, within 10 s.
     pub async fn connect(address: &str) -> Result<Client, ClientError> {
         let address = address::authority(address)?;
         let refused = |e: &dyn std::error::Error| ClientError::Connect {
@@ -111,14 +114,36 @@ impl Client {
             .keep_alive_timeout(Duration::from_secs(20));
         // The endpoint's own limit ends with TCP; a peer that takes the connection and says
         // nothing is met by this one.
-        let channel = match tokio::time::timeout(2 * CONNECT, endpoint.connect()).await {
+        let channel = match tokio::time::timeout(CONNECT, endpoint.connect()).await {
             Ok(channel) => channel.map_err(|e| refused(&e))?,
             Err(late) => return Err(refused(&late)),
         };
         let render = RenderServiceClient::new(channel)
             .max_decoding_message_size(MAX_RENDER_MESSAGE)
             .max_encoding_message_size(MAX_RENDER_MESSAGE);
-        Ok(Client { render, address: address.into() })
+        let client = Client { render, address: address.into() };
+        client.greet().await?;
+        Ok(client)
+    }
+
+    /// Asks whether a master is there. A connection alone says little: a web server takes it as well.
+    async fn greet(&self) -> Result<(), ClientError> {
+        let mut render = self.render.clone();
+        let question = render.describe_volume(wire::DescribeVolumeRequest {});
+        let problem = match tokio::time::timeout(CONNECT, question).await {
+            Err(_) => format!("it says nothing for {} s", CONNECT.as_secs()),
+            Ok(Ok(_)) => return Ok(()),
+            Ok(Err(status)) => match (status.source(), status.code()) {
+                (Some(source), _) => format!("it speaks no gRPC: {}", error::root_cause(source)),
+                // HTTP without gRPC, and gRPC without this service.
+                (None, Code::Unknown | Code::Internal | Code::Unimplemented) => {
+                    format!("it answers otherwise: {}", error::one_line(status.message()))
+                }
+                // A master that is busy, or whose answer was damaged on its way.
+                (None, _) => return Ok(()),
+            },
+        };
+        Err(ClientError::NotAMaster { address: self.address.to_string(), problem })
     }
 
     /// Returns the master's address, as `host:port`.

@@ -573,9 +573,31 @@ async fn server_that_is_no_master_is_an_error_and_no_panic() {
             let _ = stream.write_all(b"HTTP/1.1 400 Bad Request\r\n\r\n").await;
         }
     });
-    let e = match Client::connect(&address).await {
-        Ok(client) => client.job("job-0").await.unwrap_err(),
-        Err(e) => e,
-    };
-    assert!(e.to_string().contains(&address), "{e}");
+    let e = Client::connect(&address).await.unwrap_err();
+    assert!(matches!(e, ClientError::NotAMaster { .. }), "{e}");
+    let wanted = format!("no slabcast master at {address} (it speaks no gRPC");
+    assert!(e.to_string().starts_with(&wanted), "{e}");
+}
+
+#[tokio::test]
+async fn port_that_says_nothing_is_no_master_after_5_s() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let began = std::time::Instant::now();
+    let e = Client::connect(&address).await.unwrap_err();
+    assert!(e.to_string().contains("it says nothing for 5 s"), "{e}");
+    assert!(began.elapsed() < Duration::from_secs(20));
+}
+
+#[tokio::test]
+async fn other_grpc_service_is_no_master() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let routes = tonic::service::Routes::default().prepare();
+    let server = tonic::transport::Server::builder()
+        .add_routes(routes)
+        .serve_with_incoming(TcpListenerStream::new(listener));
+    tokio::spawn(server);
+    let e = Client::connect(&address).await.unwrap_err();
+    assert!(matches!(e, ClientError::NotAMaster { .. }), "{e}");
 }

@@ -105,14 +105,28 @@ pub async fn run_with(
         };
         match channel {
             Ok(channel) => {
-                info!(master, bricks = cache.len(), "connected");
-                told = false;
                 let before = tokio::time::Instant::now();
                 let ended = link(&config, &endpoint, channel, &mut cache, stop.clone()).await?;
                 match ended {
                     Ended::Refused(_) | Ended::Stopped => return Ok(ended),
-                    Ended::Lost(reason) => warn!(master, reason, "link lost, dialling again"),
-                    Ended::MasterLeft(reason) => info!(master, reason, "waiting for the master"),
+                    Ended::Lost(reason) if before.elapsed() > LONGEST_WAIT => {
+                        warn!(master, reason, "link lost, dialling again");
+                        told = false;
+                    }
+                    // What answers there may be no master, and then each try ends so.
+                    Ended::Lost(reason) => {
+                        if !std::mem::replace(&mut told, true) {
+                            warn!(
+                                master,
+                                reason,
+                                "link lost at once: is it a slabcast master? Dialling until it is"
+                            );
+                        }
+                    }
+                    Ended::MasterLeft(reason) => {
+                        info!(master, reason, "waiting for the master");
+                        told = false;
+                    }
                 }
                 if before.elapsed() > LONGEST_WAIT {
                     wait = FIRST_WAIT;

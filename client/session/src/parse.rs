@@ -1,5 +1,6 @@
 //! Values of flags: from text to what is meant, or what to give instead.
 
+use slabcast_client::DEFAULT_PORT;
 use slabcast_common::image::Background;
 use slabcast_common::shade::Light;
 use slabcast_common::transfer::NanColour;
@@ -149,13 +150,19 @@ pub fn memory(text: &str) -> Result<u64, String> {
     if range.contains(&bytes) { Ok(bytes as u64) } else { Err(bad()) }
 }
 
-/// `HOST:PORT`, the name not looked up yet. Port 0 (any free one) only where `any_port`.
+/// `HOST:PORT` or `HOST` with the default port, the name not looked up yet. Port 0 (any free one) only
+/// where `any_port`.
 fn host_port(text: &str, any_port: bool) -> Result<String, String> {
-    let bad = "give HOST:PORT, like 127.0.0.1:7433 or node7:7433";
+    let bad = "give HOST:PORT, like 127.0.0.1:7433 or node7:7433, or HOST alone for port 7433";
     if text.contains("://") {
         return Err(format!("{bad}, without a scheme"));
     }
-    let (host, port) = text.rsplit_once(':').ok_or(bad)?;
+    let default_port = DEFAULT_PORT.to_string();
+    let is_host_alone = text.ends_with(']') || !text.contains(':');
+    let (host, port) = match text.rsplit_once(':') {
+        Some((host, port)) if !is_host_alone => (host, port),
+        _ => (text, default_port.as_str()),
+    };
     let bare_v6 = host.contains(':') && !(host.starts_with('[') && host.ends_with(']'));
     if bare_v6 {
         return Err("write an IPv6 address in brackets, like [::1]:7433".into());
@@ -163,7 +170,7 @@ fn host_port(text: &str, any_port: bool) -> Result<String, String> {
     let sane = |c: char| c.is_ascii_alphanumeric() || ".-_[]:%".contains(c);
     match port.parse::<u16>() {
         Ok(port) if !host.is_empty() && host.chars().all(sane) && (any_port || port > 0) => {
-            Ok(text.to_string())
+            Ok(format!("{host}:{port}"))
         }
         _ => Err(bad.into()),
     }
@@ -566,8 +573,10 @@ mod tests {
         for good in ["127.0.0.1:7433", "node-7.example:1", "[::1]:65535"] {
             assert_eq!(master(good).as_deref(), Ok(good));
         }
+        assert_eq!(master("node7").as_deref(), Ok("node7:7433"));
+        assert_eq!(master("[::1]").as_deref(), Ok("[::1]:7433"));
         assert!(listen("localhost:0").is_ok() && master("localhost:0").is_err());
-        for bad in ["", "host", "host:", ":7433", "host:70000", "::1:7433", "http://a:1", "a b:1"] {
+        for bad in ["", "::1", "host:", ":7433", "host:70000", "::1:7433", "http://a:1", "a b:1"] {
             assert!(master(bad).is_err(), "{bad}");
         }
     }

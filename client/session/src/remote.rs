@@ -9,6 +9,7 @@ use slabcast_client::{
     Client, ClientError, JobState, PATIENCE, Submitted, VolumeDescription, local_field,
 };
 use slabcast_common::quality::InvalidField;
+use slabcast_common::volume::Digest32;
 use slabcast_scene::request::PathRequest;
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
@@ -59,11 +60,13 @@ pub async fn describe(client: &Client) -> Result<VolumeDescription, Fail> {
 /// Submits a path to a master behind a network and returns its updates.
 ///
 /// # Errors
-/// The master refuses the request or doesn't answer.
+/// The master refuses the request, serves another volume than the one with this digest, or doesn't
+/// answer.
 pub async fn submit(
     client: Client,
     request: &RenderRequest,
     message: PathRequest,
+    volume: Digest32,
 ) -> Result<Source, Fail> {
     let submitted = client.submit_framed(&message).await.map_err(|e| match &e {
         ClientError::InvalidField { field, problem } => {
@@ -72,21 +75,46 @@ pub async fn submit(
         _ => client_failure(&e),
     })?;
     let Submitted { job, framing } = submitted;
+    check_volume(&client, &job, volume).await?;
     let (name, job_now) = watch::channel(job);
     let (to, updates) = mpsc::channel(1);
     let cancel = Cancel::new(cancel(client.clone(), job_now));
     tokio::spawn(async move {
-        if let Err(e) = pump(&client, message, name, &to).await {
+        if let Err(e) = pump(&client, message, volume, name, &to).await {
             let _ = to.send(Err(e)).await;
         }
     });
     Ok(Source { updates, cancel, framing })
 }
 
+/// Checks that a master serves the volume that the pictures are of, after the job was submitted: one
+/// that is started anew with another volume does not know the job. Cancels the job otherwise.
+///
+/// # Errors
+/// The master serves another volume, or doesn't answer.
+async fn check_volume(client: &Client, job: &str, volume: Digest32) -> Result<(), Fail> {
+    let served = client.volume().await.map_err(|e| client_failure(&e))?;
+    if served.info.digest == volume {
+        return Ok(());
+    }
+    let _ = client.cancel(job).await;
+    let (was, is) = (volume.to_string(), served.info.digest.to_string());
+    Err(Fail::failed(format!(
+        "the master at {} serves another volume now: {} ({}...), and the pictures are of {}...; frames \
+         that are written show that one. Start the master with it again, or draw the new one into \
+         another folder",
+        client.address(),
+        served.name,
+        &is[..8],
+        &was[..8],
+    )))
+}
+
 /// Passes a job's updates on until its last frame.
 async fn pump(
     client: &Client,
     mut message: PathRequest,
+    volume: Digest32,
     job: watch::Sender<String>,
     to: &mpsc::Sender<Result<Update, Fail>>,
 ) -> Result<(), Fail> {
@@ -103,6 +131,7 @@ async fn pump(
                 );
                 message.client_key = crate::request::client_key();
                 let name = client.submit(&message).await.map_err(|e| client_failure(&e))?;
+                check_volume(client, &name, volume).await?;
                 job.send_replace(name);
             }
             Err(e) => return Err(client_failure(&e)),

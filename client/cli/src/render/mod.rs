@@ -368,7 +368,7 @@ async fn cluster(
     let recipe = run.ready(&served.info, served.orientation, served.anatomical)?;
     let message = run.request(&served.info);
     let source = tokio::select! {
-        source = remote::submit(client, &run.request, message) => source?,
+        source = remote::submit(client, &run.request, message, served.info.digest) => source?,
         code = signals::stopped() => return Err(Fail::silent(code)),
     };
     let what = format!("{} on the cluster of {master}", served.name);

@@ -37,7 +37,7 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     }
     let pictures = matching(tiff_stack::sniff);
     if !pictures.is_empty() {
-        return Ok(tiff_stack::read_files(pictures, &name, &hints.raw, hints.cap())?.into());
+        return tiff_stack::read_files(pictures, &name, &hints.raw, hints.cap());
     }
     // Suggest volume files that the user may have meant.
     const ENDS: [&str; 9] =

@@ -61,7 +61,6 @@ mod sketch;
 mod source;
 mod store;
 mod tiff_stack;
-#[cfg(feature = "zarr")]
 mod units;
 mod unpack;
 mod vti;
@@ -165,8 +164,8 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
     }
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let folder = path.parent().unwrap_or(Path::new("."));
-    let error = match read(source, folder, &name, hints) {
-        Ok(volume) => return Ok(volume.into()),
+    let error = match read_noted(source, folder, &name, hints) {
+        Ok(opened) => return Ok(opened),
         Err(e) => e,
     };
     // A data file with a header beside it is opened through the header.
@@ -199,6 +198,19 @@ fn header_beside(path: &Path) -> Option<PathBuf> {
         let names = head.windows(name.len()).any(|w| w == name.as_bytes());
         (header != path && names).then_some(header)
     })
+}
+
+/// Reads a volume with its reader's notes. TIFF alone has some.
+fn read_noted(
+    mut source: Source,
+    folder: &Path,
+    name: &str,
+    hints: &Hints,
+) -> Result<Opened, Problem> {
+    if tiff_stack::sniff(source.head()?) && hints.raw.dims.is_none() {
+        return tiff_stack::read(source, name, &hints.raw);
+    }
+    read(source, folder, name, hints).map(Opened::from)
 }
 
 /// Reads a volume; its first bytes decide the format. `folder` is where detached data may lie.
@@ -260,7 +272,7 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
         return vti::read(source, name);
     }
     if tiff_stack::sniff(head) {
-        return tiff_stack::read(source, name, &hints.raw);
+        return tiff_stack::read(source, name, &hints.raw).map(|opened| opened.volume);
     }
     if raw::is_described(name, &hints.raw) || is_raw(name) {
         return raw::read(source, false, name, &hints.raw);

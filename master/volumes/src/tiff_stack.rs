@@ -4,17 +4,26 @@
 //! The `tiff` crate decodes strips and tiles. This reader asks for one band of them at a time, so
 //! that no page is held whole, and checks that a band is no larger than the file can account for.
 //! TIFF has no field for the distance between pages: it comes from the description if ImageJ or OME
-//! wrote one. Resolutions alone are ignored, since picture programs fill in 72 dpi.
+//! wrote one. Resolutions alone are ignored, since picture programs fill in 72 dpi. Nor has it one
+//! for channels and times, which are pages too: the description tells them from slices, and the
+//! first is read.
 
+mod as_stored;
+mod description;
+
+use crate::Opened;
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::limit::ByteCap;
 use crate::raw::RawHints;
 use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
-use crate::source::{Source, Stream};
+use crate::source::Source;
+use crate::units::steps_in_mm;
 use crate::unpack::wrapped;
+use as_stored::AsStored;
+use description::{Description, Slices, Writer};
 use slabcast_common::volume::{Lattice, Volume};
 use std::collections::VecDeque;
-use std::io::{BufReader, Read};
+use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use tiff::decoder::{ChunkType, Decoder, Limits};
 use tiff::tags::Tag;
@@ -26,6 +35,8 @@ const BAND_MAX_BYTES: u64 = 48 << 20;
 /// Most bytes of a band in a small file. A larger band needs at least half as many bytes in the
 /// file, so that a small file can't take much memory.
 const BAND_FREE_BYTES: u64 = 8 << 20;
+/// Most pages of a file with several channels or times: 16 of each slice.
+const PAGES_MAX: u64 = 16 * DIM_MAX;
 
 /// Returns whether the first bytes are TIFF or BigTIFF.
 pub(crate) fn sniff(head: &[u8]) -> bool {
@@ -33,32 +44,111 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 }
 
 /// Reads the pages of one file as slices.
-pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Volume, Problem> {
+pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Opened, Problem> {
     let (len, cap) = (source.len, source.cap);
     let mut pages = TiffFile::open(source)?;
     let first = pages.page()?;
+    let mut description = pages.description(&first)?;
+    let said = description.slices();
+    // Pictures after the first of an OME or tifffile file are volumes of their own.
+    let several = match description.writer {
+        Writer::Ome => description.pictures > 1,
+        Writer::Shaped => said.is_some_and(|s| s.total > 1),
+        Writer::ImageJ | Writer::None => false,
+    };
+    let first_picture = said.filter(|_| several).map(|s| s.total);
+    let most = if said.is_some_and(|s| s.total > s.count) { PAGES_MAX } else { DIM_MAX };
     let mut count = 1;
     while pages.next()? {
+        if first_picture == Some(count) {
+            description.notes.push("the first of several pictures in the file was read".into());
+            break;
+        }
         let page = pages.page()?;
         if page != first {
             return Err(page_differs(&format!("page {}", count + 1), &page, &first));
         }
         count += 1;
-        if count > DIM_MAX {
+        if count > most {
             return Err(too_many(count));
         }
     }
-    let spacing = pages.first_spacing(count)?;
     pages.rewind()?;
-    let stack = Stack {
-        current: Some(pages),
-        files: VecDeque::new(),
-        page: first,
-        band: Vec::new(),
-        consumed: 0,
-        row: 0,
+    let mut planes_start = None;
+    let slices = match said {
+        None => Slices { count, stride: 1, total: count },
+        Some(said) if said.total == count => said,
+        // A program may have changed the pages and kept the text.
+        Some(said) if said.total < count && said.total == said.count => {
+            Slices { count, stride: 1, total: count }
+        }
+        Some(said) => {
+            planes_start = match description.writer {
+                Writer::ImageJ | Writer::Shaped if count == 1 => {
+                    pages.planes_start(&first, said.total, len)
+                }
+                _ => None,
+            };
+            if planes_start.is_none() {
+                return Err(too_few(said, count));
+            }
+            said
+        }
     };
-    finish(stack, count, (len, cap), name, hints.spacing.or(spacing))
+    let mut notes = std::mem::take(&mut description.notes);
+    notes.extend(pages.notes());
+    let spacing = match hints.spacing {
+        Some(spacing) => Some(spacing),
+        None => pages.spacing(description, &mut notes),
+    };
+    let volume = match planes_start {
+        Some(start) => {
+            let endian = match pages.decoder.byte_order() {
+                tiff::tags::ByteOrder::LittleEndian => Endian::Little,
+                tiff::tags::ByteOrder::BigEndian => Endian::Big,
+            };
+            let bytes = first.bytes();
+            let supply = Supply::Plain { have: slices.total * bytes };
+            let planes = Planes { pages, start, bytes, slices, plane: 0, left: 0 };
+            finish(planes, supply, (first, slices.count, endian), cap, name, spacing)?
+        }
+        None => {
+            let stack = Stack {
+                current: Some(pages),
+                files: VecDeque::new(),
+                page: first,
+                stride: slices.stride,
+                left: slices.count - 1,
+                band: Vec::new(),
+                consumed: 0,
+                row: 0,
+            };
+            finish(stack, encoded(len), (first, slices.count, NATIVE), cap, name, spacing)?
+        }
+    };
+    Ok(Opened { volume, notes })
+}
+
+/// Byte order of bands, which the `tiff` crate decodes to that of the machine.
+const NATIVE: Endian = if cfg!(target_endian = "big") { Endian::Big } else { Endian::Little };
+
+/// Returns the supply of pages in files of `len` bytes. LZW is the densest encoding read: a code of
+/// 12 bits stands for at most 4096 bytes.
+fn encoded(len: u64) -> Supply {
+    Supply::Encoded { name: "TIFF", bytes: len, ratio: 4096 }
+}
+
+fn too_few(said: Slices, pages: u64) -> Problem {
+    Problem::unsupported(
+        "ImageDescription",
+        format!(
+            "says {} channels or times of {} slices, so {} pictures, and {pages} pages are there",
+            said.total / said.count,
+            said.count,
+            said.total
+        ),
+        "save one channel and one time, a page for each slice",
+    )
 }
 
 /// Reads TIFF files, in the order given, as slices of a volume called `name`, of at most `cap`.
@@ -67,8 +157,9 @@ pub(crate) fn read_files(
     name: &str,
     hints: &RawHints,
     cap: ByteCap,
-) -> Result<Volume, Problem> {
-    let (mut first, mut spacing, mut total) = (None, None, 0);
+) -> Result<Opened, Problem> {
+    let (mut first, mut spacing, mut total) = (None, hints.spacing, 0);
+    let mut notes = Vec::new();
     let count = files.len() as u64;
     if count > DIM_MAX {
         return Err(too_many(count));
@@ -85,7 +176,16 @@ pub(crate) fn read_files(
         let page = file.page().map_err(name_file)?;
         match &first {
             None => {
-                spacing = file.first_spacing(count)?;
+                let mut description = file.description(&page).map_err(name_file)?;
+                if let Some(said) = description.slices()
+                    && (said.total > count || said.total != said.count)
+                {
+                    return Err(name_file(too_few(said, count)));
+                }
+                notes.extend(file.notes());
+                if spacing.is_none() {
+                    spacing = file.spacing(description, &mut notes);
+                }
                 first = Some(page);
             }
             Some(first) if page != *first => {
@@ -106,29 +206,30 @@ pub(crate) fn read_files(
         current: None,
         files: files.into(),
         page,
+        stride: 1,
+        left: 0,
         band: Vec::new(),
         consumed: 0,
         row: page.height,
     };
-    finish(stack, count, (total, cap), name, hints.spacing.or(spacing))
+    let volume = finish(stack, encoded(total), (page, count, NATIVE), cap, name, spacing)?;
+    Ok(Opened { volume, notes })
 }
 
 fn finish(
-    mut stack: Stack,
-    count: u64,
-    (len, cap): (u64, ByteCap),
+    mut samples: impl Read + Send,
+    supply: Supply,
+    (page, count, endian): (Page, u64, Endian),
+    cap: ByteCap,
     name: &str,
     spacing: Option<[f64; 3]>,
 ) -> Result<Volume, Problem> {
-    let Page { width, height, number } = stack.page;
-    let endian = if cfg!(target_endian = "big") { Endian::Big } else { Endian::Little };
+    let Page { width, height, number } = page;
     let dims = [width.into(), height.into(), count];
     let layout = Layout::new(dims, number, endian, "pages")?;
     let lattice = Lattice::from_spacing(layout.dims, spacing.unwrap_or([1.0; 3]));
     lattice.check().map_err(|e| Problem::malformed("spacing", e, "give it with --spacing"))?;
-    // LZW is the densest encoding read: a code of 12 bits stands for at most 4096 bytes.
-    let supply = Supply::Encoded { name: "TIFF", bytes: len, ratio: 4096 };
-    let (samples, map) = samples::read(&mut stack, supply, &layout, cap)?;
+    let (samples, map) = samples::read(&mut samples, supply, &layout, cap)?;
     Ok(Volume::new(name, number.name(), false, lattice, samples, map))
 }
 
@@ -157,6 +258,12 @@ struct Page {
     number: Number,
 }
 
+impl Page {
+    fn bytes(&self) -> u64 {
+        u64::from(self.width) * u64::from(self.height) * self.number.bytes()
+    }
+}
+
 impl std::fmt::Display for Page {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{} x {} {}", self.width, self.height, self.number.name())
@@ -165,8 +272,10 @@ impl std::fmt::Display for Page {
 
 /// An open TIFF file, positioned at one of its pages.
 struct TiffFile {
-    decoder: Decoder<BufReader<Box<dyn Stream>>>,
+    decoder: Decoder<BufReader<AsStored>>,
     band_max_bytes: u64,
+    white_is_zero: bool,
+    palette: bool,
 }
 
 impl TiffFile {
@@ -176,9 +285,12 @@ impl TiffFile {
         limits.decoding_buffer_size = band_max_bytes as usize;
         limits.intermediate_buffer_size = band_max_bytes as usize;
         limits.ifd_value_size = 1 << 20;
+        let stream = AsStored::new(source.reader.into_inner(), source.len)
+            .map_err(|e| Problem::io("file", &e))?;
+        let (white_is_zero, palette) = (stream.white_is_zero, stream.palette);
         let decoder =
-            Decoder::new(source.reader).map_err(|e| tiff_problem(&e))?.with_limits(limits);
-        Ok(TiffFile { decoder, band_max_bytes })
+            Decoder::new(BufReader::new(stream)).map_err(|e| tiff_problem(&e))?.with_limits(limits);
+        Ok(TiffFile { decoder, band_max_bytes, white_is_zero, palette })
     }
 
     /// Moves to the next page that is no thumbnail; false if there is none.
@@ -315,109 +427,83 @@ impl TiffFile {
         Err(Problem::malformed("StripOffsets", "has fewer entries than the page needs", RESAVE))
     }
 
-    /// Returns the sample distances, in mm, of the first page's description. Refuses a description
-    /// with several channels or more pages than there are.
-    fn first_spacing(&mut self, pages: u64) -> Result<Option<[f64; 3]>, Problem> {
-        // The description is on the first page.
+    /// Returns notes on how stored values were taken.
+    fn notes(&self) -> Vec<String> {
+        let palette = "its colours come from a palette; the stored indices were read";
+        let white = "in its pictures 0 is white; the stored values were read";
+        let notes = [(self.palette, palette), (self.white_is_zero, white)];
+        notes.iter().filter(|n| n.0).map(|n| n.1.to_string()).collect()
+    }
+
+    /// Returns the first page's description, an empty one if there is none.
+    fn description(&mut self, page: &Page) -> Result<Description, Problem> {
         self.rewind()?;
-        let Ok(text) = self.decoder.get_tag_ascii_string(Tag::ImageDescription) else {
-            return Ok(None);
-        };
-        let resolution = |d: &mut Decoder<_>, tag| match d.find_tag(tag).ok().flatten() {
-            Some(tiff::decoder::ifd::Value::Rational(a, b)) if a > 0 && b > 0 => {
-                Some(f64::from(b) / f64::from(a))
-            }
-            _ => None,
-        };
-        let description = Description::parse(&text);
-        if description.channels > 1 || description.images > pages {
-            return Err(Problem::unsupported(
-                "ImageDescription",
-                format!(
-                    "says {} channels or times of {} pictures, and {pages} pages are there",
-                    description.channels, description.images
-                ),
-                "save one channel and one time, a page for each slice",
-            ));
+        match self.decoder.get_tag_ascii_string(Tag::ImageDescription) {
+            Ok(text) => Description::parse(&text, page.width, page.height),
+            Err(_) => Ok(Description::default()),
         }
-        let pixel_spacing = match description.pixel_spacing {
-            Some(spacing) => Some(spacing),
-            // OME gives no unit for the resolution; ImageJ's unit applies to it.
-            None if text.contains("<OME") => None,
-            None => resolution(&mut self.decoder, Tag::XResolution)
-                .zip(resolution(&mut self.decoder, Tag::YResolution)),
-        };
-        let spacing = description
-            .mm
-            .zip(pixel_spacing)
-            .map(|(mm, (x, y))| [x * mm, y * mm, description.page_spacing.unwrap_or(1.0) * mm]);
-        Ok(spacing.filter(|s| s.iter().all(|x| x.is_finite() && *x > 0.0)))
+    }
+
+    /// Returns the sample distances, in mm, by the first page's description.
+    fn spacing(
+        &mut self,
+        mut description: Description,
+        notes: &mut Vec<String>,
+    ) -> Option<[f64; 3]> {
+        let steps = &mut description.steps;
+        if description.writer == Writer::ImageJ {
+            // Its unit applies to the resolution. Without a unit that is in pixels, or not
+            // ImageJ's.
+            let unit = self.decoder.find_tag_unsigned::<u16>(Tag::ResolutionUnit).ok().flatten();
+            let used = steps[0].unit.is_some() || unit == Some(1);
+            for (step, tag) in steps.iter_mut().zip([Tag::XResolution, Tag::YResolution]) {
+                step.number = match self.decoder.find_tag(tag).ok().flatten() {
+                    Some(tiff::decoder::ifd::Value::Rational(a, b)) if used && a > 0 && b > 0 => {
+                        Some(f64::from(b) / f64::from(a))
+                    }
+                    _ if used => None,
+                    _ => Some(1.0),
+                };
+            }
+            if steps[2].number.is_none() || steps[0].number.is_none() {
+                return None;
+            }
+        }
+        if steps.iter().all(|s| s.number.is_none()) {
+            return None;
+        }
+        let (spacing, _) = steps_in_mm(steps, notes);
+        Some(spacing).filter(|s| s.iter().all(|x| x.is_finite() && *x > 0.0))
+    }
+
+    /// Returns where `total` planes begin that lie one after another, though only the first has a
+    /// page: ImageJ writes stacks of 4 GiB and more so, tifffile those it calls truncated. `None`
+    /// if the planes can't be there.
+    fn planes_start(&mut self, page: &Page, total: u64, len: u64) -> Option<u64> {
+        let compression = self.decoder.find_tag_unsigned::<u16>(Tag::Compression).ok()?;
+        if compression.is_some_and(|c| c != 1) {
+            return None;
+        }
+        let starts = self.decoder.get_tag_u64_vec(Tag::StripOffsets).ok()?;
+        let sizes = self.decoder.get_tag_u64_vec(Tag::StripByteCounts).ok()?;
+        let start = *starts.first()?;
+        let mut end = start;
+        for (strip, size) in starts.iter().zip(&sizes) {
+            if *strip != end {
+                return None;
+            }
+            end = end.checked_add(*size)?;
+        }
+        // Some writers count all planes in the page's one strip.
+        let whole = start.checked_add(total.checked_mul(page.bytes())?)?;
+        // A program that drops pages may keep the text; what follows are then no planes.
+        let directories = &self.decoder.inner().get_ref().directories;
+        let free = !directories.iter().any(|at| (start..whole).contains(at));
+        (free && end >= start.checked_add(page.bytes())? && whole <= len).then_some(start)
     }
 }
 
 const RESAVE: &str = "save it again, for instance with ImageJ";
-
-/// The description that ImageJ or OME wrote into the first page.
-#[derive(Debug, Default, PartialEq)]
-struct Description {
-    /// Millimetres of its unit, if it names one.
-    mm: Option<f64>,
-    /// Distances of pixels along x and y, if it gives them, in its unit.
-    pixel_spacing: Option<(f64, f64)>,
-    /// Distance of pages, in its unit.
-    page_spacing: Option<f64>,
-    /// Channels times points in time.
-    channels: u64,
-    /// Number of slices.
-    images: u64,
-}
-
-impl Description {
-    fn parse(text: &str) -> Description {
-        let mut description = Description { channels: 1, ..Description::default() };
-        if text.starts_with("ImageJ=") {
-            let get = |key: &str| {
-                text.lines().find_map(|l| l.strip_prefix(key)?.strip_prefix('=').map(str::trim))
-            };
-            let number = |key| get(key).and_then(|v| v.parse::<u64>().ok());
-            description.images = number("images").unwrap_or(0);
-            let product =
-                number("channels").unwrap_or(1).checked_mul(number("frames").unwrap_or(1));
-            description.channels = product.unwrap_or(u64::MAX);
-            description.mm = get("unit").and_then(millimetres);
-            description.page_spacing = get("spacing").and_then(|v| v.parse().ok());
-        } else if text.contains("<OME") {
-            let get = |key: &str| {
-                let after = text.split_once(&format!(" {key}=\""))?.1;
-                after.split_once('"').map(|(value, _)| value)
-            };
-            let number = |key| get(key).and_then(|v| v.parse::<u64>().ok()).unwrap_or(1);
-            description.channels = number("SizeC").saturating_mul(number("SizeT"));
-            description.images = number("SizeZ");
-            let size = |key: &str| {
-                let mm = millimetres(get(&format!("{key}Unit")).unwrap_or("um"))?;
-                Some(get(key)?.parse::<f64>().ok()? * mm)
-            };
-            // Converted to mm, each from its own unit.
-            description.pixel_spacing = size("PhysicalSizeX").zip(size("PhysicalSizeY"));
-            description.page_spacing = size("PhysicalSizeZ");
-            description.mm = Some(1.0);
-        }
-        description
-    }
-}
-
-/// Returns the millimetres of a unit of length; `None` if it is unknown.
-fn millimetres(unit: &str) -> Option<f64> {
-    Some(match unit {
-        "m" => 1000.0,
-        "cm" => 10.0,
-        "mm" => 1.0,
-        "um" | "\u{b5}m" | "\u{3bc}m" | "\\u00B5m" | "micron" | "microns" => 1e-3,
-        "nm" => 1e-6,
-        _ => return None,
-    })
-}
 
 /// Converts an error of the `tiff` crate.
 fn tiff_problem(e: &TiffError) -> Problem {
@@ -458,6 +544,10 @@ struct Stack {
     /// Files not yet opened.
     files: VecDeque<PathBuf>,
     page: Page,
+    /// Pages from one slice to the next of the current file.
+    stride: u64,
+    /// Slices of the current file after this one.
+    left: u64,
     band: Vec<u8>,
     /// Bytes of the band already handed out.
     consumed: usize,
@@ -469,11 +559,16 @@ impl Stack {
     /// Decodes the next band; false at the end.
     fn fill(&mut self) -> Result<bool, Problem> {
         if self.row >= self.page.height {
-            let more = match &mut self.current {
-                Some(file) if self.files.is_empty() => file.next()?,
-                _ => false,
-            };
-            if !more {
+            if let Some(file) = &mut self.current
+                && self.left > 0
+            {
+                self.left -= 1;
+                for _ in 0..self.stride {
+                    if !file.next()? {
+                        return Ok(false);
+                    }
+                }
+            } else {
                 let Some(path) = self.files.pop_front() else { return Ok(false) };
                 self.current = Some(TiffFile::open(Source::open(&path, "file")?)?);
             }
@@ -499,6 +594,38 @@ impl Read for Stack {
         let n = (self.band.len() - self.consumed).min(buf.len());
         buf[..n].copy_from_slice(&self.band[self.consumed..self.consumed + n]);
         self.consumed += n;
+        Ok(n)
+    }
+}
+
+/// Reads planes that lie one after another, without pages of their own.
+struct Planes {
+    pages: TiffFile,
+    /// Place of the first plane in the file.
+    start: u64,
+    /// Bytes of a plane.
+    bytes: u64,
+    slices: Slices,
+    /// Next slice.
+    plane: u64,
+    /// Bytes of the current slice that are still to be read.
+    left: u64,
+}
+
+impl Read for Planes {
+    fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
+        let file = self.pages.decoder.inner();
+        if self.left == 0 {
+            if self.plane == self.slices.count {
+                return Ok(0);
+            }
+            let at = self.start + self.plane * self.slices.stride * self.bytes;
+            file.seek(SeekFrom::Start(at))?;
+            self.plane += 1;
+            self.left = self.bytes;
+        }
+        let n = file.take(self.left).read(buf)?;
+        self.left -= n as u64;
         Ok(n)
     }
 }

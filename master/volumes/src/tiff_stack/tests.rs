@@ -90,3 +90,165 @@ fn tiff_folder_is_sorted_by_number_and_must_have_pages_of_one_kind() {
     let e = crate::open(dir.path()).unwrap_err().to_string();
     assert!(e.contains("s 11.tif"), "{e}");
 }
+
+/// A file of pages of 4 x 3 values 0, 1, 2, ... of uint8 or, with 2 `bytes`, uint16, with the
+/// given text in the first. `pages` of its `planes` have a page of their own.
+fn by_hand(text: &str, planes: u32, pages: u32, bytes: u16, photometric: u16) -> Vec<u8> {
+    let plane = 12 * u32::from(bytes);
+    let mut out = b"II*\0".to_vec();
+    let data = 8 + text.len() as u32 + 1;
+    let data = data + data % 2;
+    let mut next = data + planes * plane;
+    out.extend(next.to_le_bytes());
+    out.extend(text.as_bytes());
+    out.resize(data as usize, 0);
+    for i in 0..planes * 12 {
+        out.extend(&(i as u16).to_le_bytes()[..bytes.into()]);
+    }
+    for page in 0..pages {
+        let mut tags: Vec<(u16, u16, u32, u32)> = vec![
+            (256, 3, 1, 4),
+            (257, 3, 1, 3),
+            (258, 3, 1, 8 * u32::from(bytes)),
+            (259, 3, 1, 1),
+            (262, 3, 1, photometric.into()),
+            (273, 4, 1, data + page * plane),
+            (277, 3, 1, 1),
+            (278, 3, 1, 3),
+            (279, 4, 1, plane),
+        ];
+        if page == 0 {
+            tags.insert(5, (270, 2, text.len() as u32 + 1, 8));
+        }
+        out.extend((tags.len() as u16).to_le_bytes());
+        for (tag, kind, count, value) in &tags {
+            out.extend(tag.to_le_bytes());
+            out.extend(kind.to_le_bytes());
+            out.extend(count.to_le_bytes());
+            out.extend(value.to_le_bytes());
+        }
+        next += 6 + 12 * tags.len() as u32;
+        out.extend(if page + 1 < pages { next } else { 0 }.to_le_bytes());
+    }
+    out
+}
+
+fn noted(bytes: Vec<u8>) -> Result<(Volume, String), Problem> {
+    let hints = crate::Hints::default();
+    let opened = crate::read_noted(Source::from_bytes(bytes), Path::new("."), "t.tif", &hints)?;
+    Ok((opened.volume, opened.notes.join("\n")))
+}
+
+fn ome(prefix: &str, quote: &str, pixels: &str) -> String {
+    format!("<?xml version=\"1.0\"?><{prefix}OME><{prefix}Image><{prefix}Pixels {pixels}></{prefix}Pixels></{prefix}Image></{prefix}OME>")
+        .replace('"', quote)
+}
+
+#[test]
+fn tiff_channels_and_times_are_axes_and_the_first_is_read() {
+    let order =
+        |order: &str| format!("DimensionOrder=\"{order}\" SizeC=\"2\" SizeZ=\"3\" SizeT=\"1\"");
+    for (text, stride, say) in [
+        (r#"{"shape": [2, 3, 3, 4], "axes": "CZYX"}"#.to_string(), 1, "the first of 2 channels"),
+        (r#"{"shape": [2, 3, 3, 4], "axes": "TZYX"}"#.into(), 1, "the first of 2 times"),
+        (r#"{"shape": [3, 2, 3, 4], "axes": "ZCYX"}"#.into(), 2, "the first of 2 channels"),
+        (r#"{"axes": "TZCYX", "shape": [1, 3, 2, 3, 4]}"#.into(), 2, "the first of 2 channels"),
+        (r#"{"shape": [2, 3, 3, 4]}"#.into(), 1, "the first of 2 along axis 0"),
+        (r#"{"shape": [2, 3, 3, 4, 1]}"#.into(), 1, "the first of 2 along axis 0"),
+        ("ImageJ=1.53\nimages=6\nchannels=2\nslices=3\nhyperstack=true\n".into(), 2, "2 channels"),
+        ("ImageJ=1.53\nimages=6\nslices=3\nframes=2\nhyperstack=true\n".into(), 1, "2 times"),
+        ("ImageJ=1.53\nimages=6\nchannels=2\n".into(), 2, "2 channels"),
+        (ome("", "\"", &order("XYZCT")), 1, "the first of 2 channels"),
+        (ome("ome:", "\"", &order("XYZCT")), 1, "the first of 2 channels"),
+        (ome("", "'", &order("XYCZT")), 2, "the first of 2 channels"),
+    ] {
+        let (v, notes) =
+            noted(by_hand(&text, 6, 6, 1, 1)).unwrap_or_else(|e| panic!("{text}: {e}"));
+        assert_eq!(v.lattice.dims, [4, 3, 3], "{text}");
+        let want = (0..3).flat_map(|z| (0..12).map(move |i| z * stride * 12 + i)).collect();
+        assert_eq!(v.samples, Samples::U8(want), "{text}");
+        assert!(notes.contains(say), "{text}: {notes}");
+    }
+    // Frames alone are no slices.
+    let (v, notes) =
+        noted(by_hand("{\"shape\": [6, 3, 4], \"axes\": \"TYX\"}", 6, 6, 1, 1)).unwrap();
+    assert_eq!(v.lattice.dims, [4, 3, 1]);
+    assert!(notes.contains("the first of 6 times"), "{notes}");
+    // Slices alone, and a text whose pages have changed.
+    for text in [
+        "{\"shape\": [6, 3, 4]}",
+        "{\"shape\": [6, 3, 4], \"axes\": \"QYX\"}",
+        "{\"shape\": [9, 9, 9]}",
+        "ImageJ=1\nimages=1\n",
+        "{\"shape\": null}",
+    ] {
+        let (v, notes) = noted(by_hand(text, 6, 6, 1, 1)).unwrap();
+        assert_eq!((v.lattice.dims, notes.as_str()), ([4, 3, 6], ""), "{text}");
+    }
+    // Where it can't be told, or does not fit, the refusal says so.
+    for (text, say) in [
+        ("{\"shape\": [2, 5, 3, 4], \"axes\": \"CZYX\"}", "2 channels or times of 5 slices"),
+        ("{\"shape\": [6, 3, 4], \"axes\": \"ZXY\"}", "the axes `ZXY`, whose last are not Y and X"),
+        ("ImageJ=1\nimages=7\nchannels=2\n", "which don't divide"),
+    ] {
+        let e = noted(by_hand(text, 6, 6, 1, 1)).unwrap_err().to_string();
+        assert!(e.contains("ImageDescription") && e.contains(say), "{text}: {e}");
+    }
+    // Pages told one by one, in another order than that of the dimensions.
+    let told = ome("", "\"", &order("XYZCT"))
+        .replace("</Pixels>", "<TiffData FirstC=\"0\" FirstZ=\"1\" IFD=\"2\"/></Pixels>");
+    let e = noted(by_hand(&told, 6, 6, 1, 1)).unwrap_err().to_string();
+    assert!(e.contains("not in the order `XYZCT`"), "{e}");
+}
+
+#[test]
+fn tiff_planes_without_pages_are_all_read() {
+    for (text, stride) in [
+        ("{\"shape\": [6, 3, 4], \"truncated\": true}", 1),
+        ("ImageJ=1.53\nimages=6\nslices=6\n", 1),
+        ("ImageJ=1.53\nimages=12\nchannels=2\nslices=6\n", 2),
+    ] {
+        let planes = 6 * stride;
+        let (v, _) = noted(by_hand(text, planes, 1, 2, 1)).unwrap();
+        assert_eq!(v.lattice.dims, [4, 3, 6], "{text}");
+        let want =
+            (0..6).flat_map(|z| (0..12).map(move |i| (z * stride * 12 + i) as u16)).collect();
+        assert_eq!(v.samples, Samples::U16(want), "{text}");
+    }
+    // More than the file has.
+    let text = "{\"shape\": [600, 3, 4], \"truncated\": true}";
+    let e = noted(by_hand(text, 6, 1, 2, 1)).unwrap_err().to_string();
+    assert!(e.contains("so 600 pictures, and 1 pages are there"), "{e}");
+}
+
+#[test]
+fn tiff_white_is_zero_and_palette_keep_stored_values() {
+    for bytes in [1, 2] {
+        for (photometric, say) in [(0, "0 is white"), (3, "the stored indices were read"), (1, "")]
+        {
+            let (v, notes) = noted(by_hand("", 3, 3, bytes, photometric)).unwrap();
+            let codes: Vec<f64> = (0..36).map(|i| v.summary.map.value(v.samples.code(i))).collect();
+            assert_eq!(codes, (0..36).map(f64::from).collect::<Vec<_>>(), "{photometric}");
+            assert!(notes.contains(say) && notes.is_empty() == say.is_empty(), "{notes}");
+        }
+    }
+}
+
+#[test]
+fn ome_tiff_step_that_is_missing_or_without_known_unit_goes_by_x_and_is_noted() {
+    let x_and_y = "SizeZ=\"3\" PhysicalSizeX=\"0.5\" PhysicalSizeY=\"0.5\"";
+    for (z, want, say) in [
+        ("", 0.5e-3, "does not say the step along z; that of x was taken"),
+        ("PhysicalSizeZ=\"0\"", 0.5e-3, "does not say the step along z"),
+        ("PhysicalSizeZ=\"0.75\"", 0.75e-3, ""),
+        ("PhysicalSizeZ=\"5e-06\" PhysicalSizeZUnit=\"dm\"", 0.5e-3, ""),
+        ("PhysicalSizeZ=\"7500\" PhysicalSizeZUnit=\"\u{c5}\"", 0.75e-3, ""),
+        ("PhysicalSizeZ=\"2\" PhysicalSizeZUnit=\"reference frame\"", 2e-3, "no known length"),
+    ] {
+        let text = ome("", "\"", &format!("{x_and_y} {z}"));
+        let (v, notes) = noted(by_hand(&text, 3, 3, 1, 1)).unwrap();
+        let got = v.lattice.spacing();
+        assert!((got[2] / want - 1.0).abs() < 1e-9 && got[0] == 0.5e-3, "{z}: {got:?}");
+        assert!(notes.contains(say) && notes.is_empty() == say.is_empty(), "{z}: {notes}");
+    }
+}

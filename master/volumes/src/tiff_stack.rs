@@ -23,7 +23,7 @@ use as_stored::AsStored;
 use description::{Description, Slices, Writer};
 use slabcast_common::volume::{Lattice, Volume};
 use std::collections::VecDeque;
-use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use tiff::decoder::{ChunkType, Decoder, Limits};
 use tiff::tags::Tag;
@@ -274,6 +274,8 @@ impl std::fmt::Display for Page {
 struct TiffFile {
     decoder: Decoder<BufReader<AsStored>>,
     band_max_bytes: u64,
+    /// Bytes of the file.
+    len: u64,
     white_is_zero: bool,
     palette: bool,
 }
@@ -290,7 +292,7 @@ impl TiffFile {
         let (white_is_zero, palette) = (stream.white_is_zero, stream.palette);
         let decoder =
             Decoder::new(BufReader::new(stream)).map_err(|e| tiff_problem(&e))?.with_limits(limits);
-        Ok(TiffFile { decoder, band_max_bytes, white_is_zero, palette })
+        Ok(TiffFile { decoder, band_max_bytes, len: source.len, white_is_zero, palette })
     }
 
     /// Moves to the next page that is no thumbnail; false if there is none.
@@ -390,7 +392,7 @@ impl TiffFile {
             self.check_chunk(index)?;
             let (w, h) = self.decoder.chunk_data_dimensions(index);
             if (w, h) == (page.width, rows) {
-                self.decoder.read_chunk_bytes(index, band).map_err(|e| tiff_problem(&e))?;
+                self.decoder.read_chunk_bytes(index, band).map_err(|e| self.tile_problem(&e))?;
                 return Ok(rows);
             }
         }
@@ -407,12 +409,33 @@ impl TiffFile {
             tile.clear();
             samples::reserve(&mut tile, w * h * size)?;
             tile.resize(w * h * size, 0);
-            self.decoder.read_chunk_bytes(index, &mut tile).map_err(|e| tiff_problem(&e))?;
+            self.decoder.read_chunk_bytes(index, &mut tile).map_err(|e| self.tile_problem(&e))?;
             for (row, tile_row) in band.chunks_exact_mut(stride).zip(tile.chunks_exact(w * size)) {
                 row[left..left + w * size].copy_from_slice(tile_row);
             }
         }
         Ok(rows)
+    }
+
+    /// Converts an error of decoding a chunk. The `tiff` crate (0.11.3, its issue 395) stops before
+    /// the end of some tiles in LZW that are whole, as if the file were cut off.
+    fn tile_problem(&mut self, e: &TiffError) -> Problem {
+        let ends = matches!(e, TiffError::IoError(e) if e.kind() == ErrorKind::UnexpectedEof);
+        let tiled = self.decoder.get_chunk_type() == ChunkType::Tile;
+        let lzw = self.decoder.find_tag_unsigned::<u16>(Tag::Compression).ok().flatten();
+        let list = |d: &mut Decoder<_>, tag| d.get_tag_u64_vec(tag).unwrap_or_default();
+        let starts = list(&mut self.decoder, Tag::TileOffsets);
+        let sizes = list(&mut self.decoder, Tag::TileByteCounts);
+        let whole = starts.iter().zip(&sizes).all(|(at, n)| at.saturating_add(*n) <= self.len);
+        if !(ends && tiled && lzw == Some(5) && whole) {
+            return tiff_problem(e);
+        }
+        Problem::unsupported(
+            "Compression",
+            "is LZW in tiles, some of which this version can't decode",
+            "save it with deflate, uncompressed, or in strips, for instance with \
+             `tiffcp -c zip -s IN OUT`",
+        )
     }
 
     /// Refuses a chunk that the file does not list; the `tiff` crate would panic.
@@ -512,7 +535,7 @@ fn tiff_problem(e: &TiffError) -> Problem {
         text
     };
     match e {
-        TiffError::IoError(e) if e.kind() == std::io::ErrorKind::UnexpectedEof => Problem::new(
+        TiffError::IoError(e) if e.kind() == ErrorKind::UnexpectedEof => Problem::new(
             OpenErrorKind::Damaged,
             "pages",
             "truncated: the file ends before its pictures",

@@ -1,20 +1,23 @@
 //! Files made after public reports of faults, in shared/faults; where they are missing, the test
 //! prints `skipped: needs shared/faults` and passes.
 
-use slabcast_volumes::{Hints, Opened, open_with};
+use slabcast_volumes::{Hints, OpenError, Opened, open_with};
 use std::io::Write;
 use std::path::Path;
 
 /// Opens a file of the folder of faults; `None`, with a line on stderr, if the folder is missing.
 fn fault(file: &str) -> Option<Opened> {
+    Some(result(file)?.unwrap_or_else(|e| panic!("{e}")))
+}
+
+fn result(file: &str) -> Option<Result<Opened, OpenError>> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/faults");
     if !folder.is_dir() {
         // A direct write: the test harness captures only what the macros print.
         let _ = writeln!(std::io::stderr(), "skipped: needs shared/faults ({file})");
         return None;
     }
-    let opened = open_with(&folder.join(file), &Hints::default());
-    Some(opened.unwrap_or_else(|e| panic!("{e}")))
+    Some(open_with(&folder.join(file), &Hints::default()))
 }
 
 fn first_values(opened: &Opened, count: usize) -> Vec<f64> {
@@ -47,6 +50,13 @@ fn faults_of_tiff_have_one_channel_the_right_step_and_stored_values() {
             assert_eq!(first_values(&opened, 6), [3.0, 4.0, 5.0, 6.0, 7.0, 8.0], "{file}");
         }
     }
+}
+
+#[test]
+fn tiles_in_lzw_that_the_decoder_stops_in_are_not_called_truncated() {
+    let Some(opened) = result("files/tiled_lzw.tif") else { return };
+    let e = opened.expect_err("the tiff crate's issue 395").to_string();
+    assert!(e.contains("is LZW in tiles") && e.contains("save it with deflate"), "{e}");
 }
 
 #[cfg(feature = "zarr")]

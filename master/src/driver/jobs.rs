@@ -27,7 +27,7 @@ impl Driver {
             }
             return Ok(id);
         }
-        table.has_place(plan.held_bytes())?;
+        table.has_place(plan.held_bytes(), peer)?;
         let id = table.next_id();
         let mut entry = plan.entry(id);
         entry.peer = peer;

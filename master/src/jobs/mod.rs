@@ -42,6 +42,9 @@ pub const MAX_JOBS: usize = 1000;
 const MAX_REASONS: usize = 100;
 /// Most jobs in progress.
 const MAX_OPEN_JOBS: usize = 200;
+/// Divisor of the memory for requests: one address may have this part of it. Undivided, eight
+/// flights of 10,000 eyes from one address turn everybody else away.
+const PEER_SHARE_DIVISOR: usize = 2;
 
 /// Time for which a frame that a watcher took is not dropped for others'. A frame of 256 MiB takes
 /// 2 s over a gigabit. At half, such a watcher has it drawn twice; at twice this, a reader that
@@ -296,33 +299,58 @@ impl Table {
         JobId(self.last_id)
     }
 
-    /// Checks that there is a place for a job whose request takes `bytes`.
+    /// Checks that there is a place for a job from `peer` whose request takes `bytes`.
     ///
     /// # Errors
     /// [`SubmitError::Full`] with the figures.
-    pub(crate) fn has_place(&self, bytes: usize) -> Result<(), SubmitError> {
+    pub(crate) fn has_place(&self, bytes: usize, peer: Option<IpAddr>) -> Result<(), SubmitError> {
         let open = self.jobs.values().filter(|job| !job.view.state.is_over());
-        self.has_place_among(open.map(|job| job.held_bytes), bytes)
+        self.has_place_among(open.map(|job| (job.held_bytes, job.peer)), bytes, peer)
     }
 
+    /// Checks the same beside `others`: bytes and address of each. Jobs of this process (`None`) have
+    /// no share of their own.
     fn has_place_among(
         &self,
-        others: impl Iterator<Item = usize>,
+        others: impl Iterator<Item = (usize, Option<IpAddr>)>,
         bytes: usize,
+        peer: Option<IpAddr>,
     ) -> Result<(), SubmitError> {
-        let (jobs, held) = others.fold((0, 0), |(n, held), bytes| (n + 1, held + bytes));
-        if jobs >= MAX_OPEN_JOBS {
+        let (mut all, mut own) = ((0, 0), (0, 0));
+        for (held, of) in others {
+            all = (all.0 + 1, all.1 + held);
+            if of == peer {
+                own = (own.0 + 1, own.1 + held);
+            }
+        }
+        if all.0 >= MAX_OPEN_JOBS {
             return Err(SubmitError::Full(format!(
-                "the master has {jobs} jobs in progress, as many as it takes; wait, or cancel one"
+                "the master has {} jobs in progress, as many as it takes; wait, or cancel one",
+                all.0
             )));
         }
-        if held + bytes > self.most_held_bytes {
+        let most = self.most_held_bytes;
+        let most_of_a_peer = most / PEER_SHARE_DIVISOR;
+        if peer.is_some() && own.1 + bytes > most_of_a_peer {
             return Err(SubmitError::Full(format!(
-                "the requests of the {jobs} jobs in progress take {}, this one {}, and the master \
-                 has {} for them; wait, or submit the path in parts",
-                mib(held as u64),
+                "the requests of the {} jobs in progress from your address take {}, this one {}, \
+                 and one address may have {} of the {} that the master has for requests; wait, \
+                 cancel one, or submit the path in parts",
+                own.0,
+                mib(own.1 as u64),
                 mib(bytes as u64),
-                mib(self.most_held_bytes as u64)
+                mib(most_of_a_peer as u64),
+                mib(most as u64)
+            )));
+        }
+        if all.1 + bytes > most {
+            return Err(SubmitError::Full(format!(
+                "the requests of the {} jobs in progress take {}, this one {}, and the master has \
+                 {} for them; wait, or submit the path in parts",
+                all.0,
+                mib(all.1 as u64),
+                mib(bytes as u64),
+                mib(most as u64)
             )));
         }
         Ok(())
@@ -597,7 +625,7 @@ impl Jobs {
                  (--peer-jobs of the master); wait, cancel one, or put several views into one path"
             )));
         }
-        table.has_place_among(others.iter().map(|other| other.0), bytes)?;
+        table.has_place_among(others.iter().copied(), bytes, peer)?;
         table.checking.push((bytes, peer));
         Ok(Checking { jobs: self.clone(), entry: (bytes, peer) })
     }

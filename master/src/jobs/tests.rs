@@ -333,16 +333,16 @@ async fn frame_that_a_watcher_waits_for_is_missing_until_the_watcher_leaves() {
 fn requests_of_jobs_in_progress_and_of_remembered_ones_are_bounded_in_bytes() {
     let mut table = Table { most_held_bytes: 1000, ..Table::default() };
     for id in 1..=30 {
-        assert!(table.has_place(100).is_ok(), "job {id}");
+        assert!(table.has_place(100, None).is_ok(), "job {id}");
         table.insert(job(JobId(id), 1));
         table.set_state(JobId(id), JobState::Cancelled);
         assert!(table.jobs.len() <= 10 && table.held_bytes <= 1000);
     }
     for id in 31..=40 {
-        table.has_place(100).expect("ten fit");
+        table.has_place(100, None).expect("ten fit");
         table.insert(job(JobId(id), 1));
     }
-    let Err(SubmitError::Full(why)) = table.has_place(100) else { panic!("it is full") };
+    let Err(SubmitError::Full(why)) = table.has_place(100, None) else { panic!("it is full") };
     assert!(why.contains("10 jobs in progress take 1 MiB"), "{why}");
     assert_eq!((table.jobs.len(), table.held_bytes), (10, 1000));
 }
@@ -355,6 +355,32 @@ fn requests_that_are_being_checked_take_places() {
     let _second = jobs.reserve(100, None, 9).expect("it fits");
     drop(first);
     jobs.reserve(900, None, 9).expect("the first place is free again");
+}
+
+#[test]
+fn one_address_has_half_of_the_memory_for_requests() {
+    let jobs = Arc::new(Jobs::new(0, 64 << 20));
+    let [greedy, other] = [[192, 0, 2, 1], [192, 0, 2, 2]].map(|ip| Some(IpAddr::from(ip)));
+    let held: Vec<_> = (0..4)
+        .map(|i| jobs.reserve(8 << 20, greedy, 99).unwrap_or_else(|e| panic!("job {i}: {e}")))
+        .collect();
+    let Err(SubmitError::Full(why)) = jobs.reserve(1 << 20, greedy, 99) else { panic!("half") };
+    assert_eq!(
+        why,
+        "the requests of the 4 jobs in progress from your address take 32 MiB, this one 1 MiB, and \
+         one address may have 32 MiB of the 64 MiB that the master has for requests; wait, cancel \
+         one, or submit the path in parts"
+    );
+    let _own = jobs.reserve(24 << 20, None, 99).expect("this process has no such share");
+    let _others = jobs.reserve(8 << 20, other, 99).expect("half is left for others");
+    assert!(matches!(jobs.reserve(1 << 20, other, 99), Err(SubmitError::Full(_))), "64 MiB");
+    drop(held);
+    // What is decided last is what the checked request takes.
+    let mut table = jobs.lock();
+    let mut big = job(JobId(1), 1);
+    (big.peer, big.held_bytes) = (greedy, 32 << 20);
+    table.insert(big);
+    assert!(table.has_place(1, greedy).is_err() && table.has_place(1, other).is_ok());
 }
 
 #[tokio::test]

@@ -21,6 +21,10 @@ pub const BRICK_BATCHES_IN_FLIGHT: usize = 8;
 /// bytes a pixel.
 pub const FRAMES_IN_FLIGHT: usize = 4;
 
+/// Limit: frames in flight of all clients together. A client that has none in flight begins one beside
+/// [`FRAMES_IN_FLIGHT`] of others, up to this.
+pub const MOST_FRAMES_IN_FLIGHT: usize = 8;
+
 /// Threads of a master that hash and encode frames, one frame at a time each. A frame of 512x512
 /// takes 3 ms. With one thread, 15 workers that draw a frame in 3 ms wait for it; a third would
 /// have no frame to finish.

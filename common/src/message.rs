@@ -160,6 +160,9 @@ pub enum ToWorker {
         /// Whether finished pixels travel uncompressed, because packing would take longer than it
         /// saves.
         plain: bool,
+        /// Whose frame it is: a number of the client. Workers share their threads out evenly among
+        /// the clients whose tasks they have.
+        share: u64,
     },
     /// Part of a set's directory: bricks that exist, ascending by id. Parts come in order, before
     /// the set's first region. A worker keeps the [`DIRECTORIES_KEPT`] directories that came last.

@@ -93,9 +93,15 @@ struct Flight {
     store: Arc<BrickStore>,
     /// Whether a watcher waited for it when it began.
     wanted: bool,
+    /// Number of the address that its job came from.
+    share: u64,
+    /// Whether it takes memory of the reserve for addresses that have no other frame in flight.
+    in_reserve: bool,
     /// Bytes that it takes while it is made, and when it is finished.
     making_bytes: u64,
     finished_bytes: u64,
+    /// Microseconds of render threads that it took, once it is drawn.
+    took_us: Option<Micros>,
     /// Spans of the log that its lines belong to.
     frame_span: tracing::Span,
     slab_span: Option<(u32, tracing::Span)>,
@@ -112,6 +118,8 @@ pub(crate) struct Driver {
     rehearse: bool,
     /// A frame that waits for memory.
     blocked: Option<feed::Blocked>,
+    /// What each worker that refused a tile last said, and the job.
+    refusals: BTreeMap<WorkerId, (JobId, String)>,
     /// When to look for frames that may begin although nothing happens.
     look_again_at: Option<Micros>,
     /// Workers in reserve when the log told of it last.
@@ -146,6 +154,7 @@ impl Driver {
             clock: RealClock(Instant::now()),
             rehearse,
             blocked: None,
+            refusals: BTreeMap::new(),
             look_again_at: None,
             logged_reserve: 0,
             scheduler,
@@ -229,6 +238,7 @@ impl Driver {
             }
             Event::Said { worker, message, _place } => self.said(worker, message),
             Event::Detached { worker, reason, is_damage } => {
+                self.refusals.remove(&worker);
                 if let Some(is_leaving) = self.workers.remove(worker) {
                     if is_leaving {
                         info!(%worker, "worker left");
@@ -319,6 +329,7 @@ impl Driver {
             ToMaster::Result(result) => Happened::Result { worker, result },
             ToMaster::Failed { task, epoch, reason } => {
                 warn!(%worker, %task, reason, "task failed");
+                self.note_refusal(worker, (task, epoch), &reason);
                 Happened::Failed { worker, task, epoch, reason }
             }
             ToMaster::RegionSplit(piece) => Happened::HandedOver { worker, piece },

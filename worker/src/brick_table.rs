@@ -25,6 +25,11 @@ impl BrickTable {
         BrickTable { grid, bricks, directory: OnceLock::new(), held }
     }
 
+    /// Whether another table is of the same bricks.
+    pub(crate) fn is_like(&self, other: &BrickTable) -> bool {
+        self.grid == other.grid && self.bricks == other.bricks
+    }
+
     /// The grid by which the volume is cut into bricks.
     pub(crate) fn grid(&self) -> BrickGrid {
         self.grid

@@ -133,7 +133,6 @@ impl BrickCache {
     ) -> Result<(), &'static str> {
         let mut coming = match self.coming.take() {
             _ if first == 0 => {
-                self.tables.retain(|(key, _)| *key != set);
                 if bricks.len() == total as usize {
                     self.add_table(set, BrickTable::new(grid, bricks));
                     return Ok(());
@@ -156,14 +155,26 @@ impl BrickCache {
         Ok(())
     }
 
+    /// Adds a directory as the latest. Of those before, regions may still draw from the tables; these
+    /// stay, and are the ones that their bricks are put into if the master sends them again.
     fn add_table(&mut self, set: BrickSetKey, table: BrickTable) {
+        if let Some(i) = self.tables.iter().position(|(key, _)| *key == set) {
+            let here = self.tables.remove(i).filter(|(_, here)| here.is_like(&table));
+            if let Some(here) = here {
+                self.tables.push_back(here);
+                return;
+            }
+        }
         for brick in self.sets.get(&set).into_iter().flat_map(BTreeMap::values) {
             table.put(brick.id, Some(brick.clone()));
         }
         self.tables.push_back((set, Arc::new(table)));
-        if self.tables.len() > DIRECTORIES_KEPT {
-            self.tables.pop_front();
-        }
+        let mut others = self.tables.len().saturating_sub(DIRECTORIES_KEPT);
+        self.tables.retain(|(_, table)| {
+            let is_other = others > 0;
+            others = others.saturating_sub(1);
+            !is_other || Arc::strong_count(table) > 1
+        });
     }
 
     /// Drops all directories, since the master of a new link sends them anew.
@@ -240,6 +251,27 @@ mod tests {
             assert!(cache.directory(key(1), GRID, (2, 4), infos(&[11, 30])).is_err());
             assert!(cache.table(key(1)).is_none());
         }
+    }
+
+    #[test]
+    fn directory_that_a_region_draws_from_stays_and_gets_its_bricks() {
+        let mut cache = BrickCache::default();
+        assert!(cache.directory(key(0), GRID, (0, 1), infos(&[3])).is_ok());
+        let drawn = cache.table(key(0)).expect("it is here").clone();
+        for n in 1..9 {
+            assert!(cache.directory(key(n), GRID, (0, 1), infos(&[3])).is_ok());
+        }
+        assert_eq!(cache.tables.len(), DIRECTORIES_KEPT + 1);
+        // To the master it is gone, so it comes again.
+        assert!(cache.directory(key(0), GRID, (0, 1), infos(&[3])).is_ok());
+        cache.put(key(0), brick(3));
+        assert!(drawn.has(0), "the region sees its brick");
+        drop(drawn);
+        assert!(cache.directory(key(9), GRID, (0, 1), infos(&[3])).is_ok());
+        assert_eq!(cache.tables.len(), DIRECTORIES_KEPT, "those that nobody draws from go");
+        // Another list under the same key takes its place.
+        assert!(cache.directory(key(9), GRID, (0, 1), infos(&[5])).is_ok());
+        assert_eq!(cache.table(key(9)).expect("it is here").bricks()[0].id, BrickId(5));
     }
 
     #[test]

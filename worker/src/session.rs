@@ -289,12 +289,12 @@ impl<'a> Session<'a> {
             ToWorker::Scene(spec) => {
                 self.scenes.insert(spec.id, Arc::new(SceneSlot::new(spec)));
             }
-            ToWorker::Frame { frame, scene, view, finish, plain } => {
+            ToWorker::Frame { frame, scene, view, finish, plain, share } => {
                 if let Some(scene) = self.scenes.get(&scene) {
                     // The depths of a view can be checked against its volume only.
                     match convert::check_view(&scene.spec.volume.lattice, &view) {
                         Ok(()) => {
-                            let slot = FrameSlot::new(scene.clone(), view, finish, plain);
+                            let slot = FrameSlot::new(scene.clone(), view, finish, plain, share);
                             self.frames.insert(frame, Arc::new(slot));
                         }
                         Err(e) => warn!(%frame, error = %e, "ignoring a wrong view of the master"),
@@ -528,7 +528,10 @@ impl<'a> Session<'a> {
                     self.tell_pool_of_stalls();
                 }
             }
-            Progress::FrameEnded | Progress::Stalled { .. } => self.stalls.remove(key, &[]),
+            // One that gave way is with the pool and comes with a later report.
+            Progress::FrameEnded | Progress::Stalled { .. } | Progress::GaveWay => {
+                self.stalls.remove(key, &[]);
+            }
             Progress::Done(drawn) => {
                 self.stalls.remove(key, &drawn.touched);
                 let times = TaskTimes {

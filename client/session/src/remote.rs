@@ -215,6 +215,8 @@ fn step(n: &slabcast_client::JobNotice, master: &str) -> Step {
         JobState::WaitingForWorkers => {
             format!("waiting for workers: start `slabcast worker --master {master}`")
         }
+        // The master says why nothing is drawn.
+        JobState::Running if message.starts_with("waiting: ") => message.into(),
         _ => String::new(),
     };
     let detail = match n.state {

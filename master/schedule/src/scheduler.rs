@@ -15,10 +15,12 @@ use crate::state::reputation::Reputations;
 use crate::state::residency::{Residency, Transfer};
 use crate::state::workers::{LANES, Newcomer, Roster, Worker};
 use crate::{Action, Clock, Config, Event, FrameJob, Micros, Totals, WorkerIdentity, WorkerView};
-use slabcast_common::ids::{SceneId, WorkerId};
-use slabcast_common::link::FRAMES_IN_FLIGHT;
+use slabcast_common::brick::BrickSetKey;
+use slabcast_common::ids::{Epoch, FrameId, SceneId, TaskId, WorkerId};
+use slabcast_common::link::{FRAMES_IN_FLIGHT, MOST_FRAMES_IN_FLIGHT};
 use slabcast_common::message::ToWorker;
-use std::collections::{BTreeSet, VecDeque};
+use slabcast_common::occlusion::Rect;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// Tuning (frames): frames in flight while bricks saturate the link ([`LinkUse::is_saturated`]). An
 /// idle thread then waits for bricks, and more frames only make more workers request them. mri256
@@ -41,6 +43,8 @@ pub struct Scheduler {
     ended: BTreeSet<SceneId>,
     /// Workers that were found to lie.
     shut_out: BTreeSet<WorkerId>,
+    /// Whether frames of several clients were in flight at the last look.
+    was_shared: bool,
 }
 
 impl Scheduler {
@@ -66,6 +70,7 @@ impl Scheduler {
             active: VecDeque::new(),
             ended: BTreeSet::new(),
             shut_out: BTreeSet::new(),
+            was_shared: false,
         }
     }
 
@@ -116,10 +121,12 @@ impl Scheduler {
             Event::WorkerLeaving { worker } => {
                 cluster.roster.heard(worker, now);
                 if cluster.roster.leaves(worker) {
-                    let mut threads = cluster.roster.get(worker).map_or(0, |w| w.threads);
+                    let all = cluster.roster.get(worker).map_or(0, |w| w.threads);
+                    let mut threads = BTreeMap::new();
                     for frame in &mut self.active {
-                        frame.leaving(worker, threads);
-                        threads = threads.saturating_sub(frame.core().leases(worker));
+                        let threads = threads.entry(frame.share()).or_insert(all);
+                        frame.leaving(worker, *threads);
+                        *threads = threads.saturating_sub(frame.core().leases(worker));
                     }
                 }
             }
@@ -200,14 +207,14 @@ impl Scheduler {
                 let ended = cluster.residency.arrived(worker, set, bricks);
                 let bytes = cluster.residency.held_of_set(worker, set).1 - before;
                 cluster.link_use.bricks_arrived(bytes, ended.is_some(), now);
-                self.after_bricks(worker, ended, now);
+                self.after_bricks(worker, Some(set), ended, now);
             }
             Event::BricksBroken { worker, set, bricks } => {
                 cluster.roster.heard(worker, now);
                 if cluster.residency.was_sent(worker, set, &bricks) {
                     let ended = cluster.residency.broken(worker, set, &bricks);
                     cluster.link_use.bricks_arrived(0, ended.is_some(), now);
-                    self.after_bricks(worker, ended, now);
+                    self.after_bricks(worker, Some(set), ended, now);
                 } else {
                     // Its name is damaged too: nobody knows which brick it lacks. When it connects
                     // again it says which it holds.
@@ -219,18 +226,18 @@ impl Scheduler {
                 cluster.roster.heard(worker, now);
                 let indices = cluster.residency.indices(set, &bricks);
                 cluster.residency.request(worker, set, indices);
-                self.after_bricks(worker, None, now);
+                self.after_bricks(worker, Some(set), None, now);
             }
             Event::BricksForgotten { worker, set, bricks } => {
                 cluster.roster.heard(worker, now);
                 cluster.residency.evicted(worker, set, &bricks);
-                self.after_bricks(worker, None, now);
+                self.after_bricks(worker, Some(set), None, now);
             }
             Event::Pong { worker, nonce, clock_us } => {
                 cluster.roster.heard(worker, now);
                 if cluster.roster.pong(worker, nonce, clock_us, now) {
                     cluster.residency.ponged(worker, nonce);
-                    self.after_bricks(worker, None, now);
+                    self.after_bricks(worker, None, None, now);
                 }
             }
             Event::Tick => {
@@ -250,12 +257,21 @@ impl Scheduler {
         }
     }
 
-    /// Sends bricks to a worker, on the account of the first frame in flight.
-    fn after_bricks(&mut self, worker: WorkerId, ended: Option<Transfer>, now: Micros) {
-        if let (Some(frame), Some(transfer)) = (self.active.front_mut(), ended) {
+    /// Sends bricks to a worker, on the account of the first frame in flight that is drawn from the
+    /// set, or else of the first.
+    fn after_bricks(
+        &mut self,
+        worker: WorkerId,
+        set: Option<BrickSetKey>,
+        ended: Option<Transfer>,
+        now: Micros,
+    ) {
+        let is_of = |f: &Frame| set.is_some_and(|set| f.core().job.scene.bricks == set);
+        let payer = self.active.iter().position(is_of).unwrap_or(0);
+        if let (Some(frame), Some(transfer)) = (self.active.get_mut(payer), ended) {
             frame.transfer_ended(worker, transfer, now);
         }
-        let ledger = self.active.front_mut().map(|f| &mut f.core_mut().ledger);
+        let ledger = self.active.get_mut(payer).map(|f| &mut f.core_mut().ledger);
         send_bricks(&mut self.cluster, ledger, worker, now);
     }
 
@@ -296,12 +312,14 @@ impl Scheduler {
         let Some(mut worker) = self.cluster.roster.remove(id) else { return };
         self.cluster.totals.lost_workers += 1;
         let mut was_drawing = false;
-        let mut threads = worker.threads;
+        // Its threads went from one client's tasks to another's: any of them may have killed it.
+        let mut threads = BTreeMap::new();
         for frame in &mut self.active {
             let leases = frame.core().leases(id);
             let blame = blame && !worker.leaving;
-            frame.lost(&mut self.cluster, id, &worker, blame, threads, now);
-            threads = threads.saturating_sub(leases);
+            let threads = threads.entry(frame.share()).or_insert(worker.threads);
+            frame.lost(&mut self.cluster, id, &worker, blame, *threads, now);
+            *threads = threads.saturating_sub(leases);
             was_drawing |= blame && leases > 0;
         }
         if was_drawing || !blame {
@@ -384,17 +402,21 @@ impl Scheduler {
     fn step_frames(&mut self, freed_worker: Option<WorkerId>, clock: &dyn Clock) -> bool {
         let mut ended = false;
         let mut freed_worker = freed_worker;
-        self.find_saturated(freed_worker);
+        let mut share = self.active.front().map_or(0, Frame::share);
+        self.see_through(share, freed_worker);
         let mut i = 0;
         loop {
             if i == self.active.len() {
-                if !self.may_begin() || !self.begin_frame(clock) {
-                    break;
-                }
+                let Some(next) = self.next_to_begin() else { break };
+                self.begin_frame(next, clock);
                 // To the new frame all workers are new, and the one before is no longer the last.
                 if freed_worker.take().is_some() {
-                    self.find_saturated(None);
+                    self.see_through(share, None);
                 }
+            }
+            let of = self.active[i].share();
+            if std::mem::replace(&mut share, of) != of {
+                self.see_through(share, freed_worker);
             }
             let context = StepContext { freed_worker, ..self.context(i, false) };
             match self.active[i].step(&mut self.cluster, context, clock) {
@@ -412,12 +434,16 @@ impl Scheduler {
         }
         for i in 0..self.active.len() {
             if self.active[i].as_region().is_some() && !self.active[i].is_done() {
+                let of = self.active[i].share();
+                if std::mem::replace(&mut share, of) != of {
+                    self.see_through(share, freed_worker);
+                }
                 let context = StepContext { freed_worker, ..self.context(i, true) };
                 self.active[i].step(&mut self.cluster, context, clock);
             }
         }
-        while self.active.front().is_some_and(Frame::is_done) {
-            let Some(mut done) = self.active.pop_front() else { break };
+        while let Some(i) = self.next_done() {
+            let Some(mut done) = self.active.remove(i) else { break };
             done.end(&mut self.cluster);
             self.learn_from(&done, clock.now());
             let done = done.finish(&mut self.cluster, clock.now());
@@ -427,26 +453,40 @@ impl Scheduler {
         ended
     }
 
-    /// Begins the next frame in the queue, if there is one.
-    fn begin_frame(&mut self, clock: &dyn Clock) -> bool {
-        let Some(job) = self.waiting.pop_front() else { return false };
+    /// Returns the index of the first frame that is done and that no earlier one of its client
+    /// holds up.
+    fn next_done(&self) -> Option<usize> {
+        let is_held_up = |i: usize| {
+            let share = self.active[i].share();
+            self.active.range(..i).any(|f| f.share() == share)
+        };
+        (0..self.active.len()).find(|&i| self.active[i].is_done() && !is_held_up(i))
+    }
+
+    /// Begins the frame at an index of the queue.
+    fn begin_frame(&mut self, next: usize, clock: &dyn Clock) {
+        let Some(job) = self.waiting.remove(next) else { return };
         let is_first = self.active.is_empty();
         if is_first {
             self.cluster.link_use.frame_begins(clock.now());
         }
         let sole = is_first && self.waiting.is_empty();
         let (set, by_region) = (job.scene.bricks, uses_regions(&job));
-        let lane = self.lane(sole);
-        self.active.push_back(Frame::start(job, lane, sole, &mut self.cluster, clock));
+        let in_flight: BTreeSet<_> =
+            self.active.iter().map(|f| f.core().job.scene.bricks).collect();
+        let is_alone = in_flight.iter().all(|of| *of == set);
+        let lane = self.lane(sole).filter(|_| is_alone);
+        self.cluster.residency.open(set, &job.bricks, by_region, &in_flight);
+        let frame = Frame::start(job, lane, sole, &mut self.cluster, clock);
+        self.active.push_back(frame);
         let Cluster { roster, residency, active_set, .. } = &mut self.cluster;
         let available = roster.staying();
         let needed = residency.workers_to_hold(set);
-        let chosen = match by_region {
+        let chosen = match by_region && is_alone {
             true => active_set.workers(set, sole, available, needed),
             false => available,
         };
         roster.activate(chosen);
-        true
     }
 
     /// Learns from a frame that ended.
@@ -457,7 +497,10 @@ impl Scheduler {
         // But for the first of a set, a frame that began alone and ends beside others tells of
         // neither kind.
         let is_odd = others == sole && !self.cluster.active_set.is_first();
-        if done.as_region().is_none() || is_odd {
+        // Threads that other clients' frames had meanwhile make the times mean little.
+        let share = done.share();
+        let is_shared = self.active.iter().any(|f| f.share() != share);
+        if done.as_region().is_none() || is_odd || is_shared {
             return;
         }
         let cost = self.frame_cost(done, load);
@@ -486,7 +529,7 @@ impl Scheduler {
         if !self.cluster.active_set.is_first() || self.cluster.roster.in_reserve() == 0 {
             return false;
         }
-        let Some(frame) = self.active.front() else { return false };
+        let Some(frame) = self.active.front().filter(|_| !self.is_shared()) else { return false };
         let bricks_us = self.cluster.link_use.bricks_us();
         let cost = self.frame_cost(frame, FrameLoad { frame_us: 0.0, bricks_us });
         let (set, sole) = (frame.core().job.scene.bricks, frame.core().sole);
@@ -510,15 +553,40 @@ impl Scheduler {
         (0..LANES).min_by_key(frames).filter(|_| may)
     }
 
-    /// Finds the workers that have enough to render for a while, among all or just the freed one.
-    fn find_saturated(&mut self, freed_worker: Option<WorkerId>) {
+    /// Whether frames of several clients are in flight.
+    fn is_shared(&self) -> bool {
+        let mut shares = self.active.iter().map(Frame::share);
+        shares.next().is_some_and(|first| shares.any(|share| share != first))
+    }
+
+    /// Looks at the workers as the frames of one client do: what they were lent of others' frames
+    /// does not count. Each client's frames are lent out as if they were alone, and workers share
+    /// their threads out among the clients; else a client whose tiles take minutes would fill all
+    /// workers.
+    fn see_through(&mut self, share: u64, freed_worker: Option<WorkerId>) {
+        let is_shared = self.is_shared();
+        if is_shared || std::mem::replace(&mut self.was_shared, is_shared) {
+            let others: Vec<&Frame> = self.active.iter().filter(|f| f.share() != share).collect();
+            for (id, worker) in self.cluster.roster.iter_mut() {
+                let leases = others.iter().map(|f| u64::from(f.core().leases(id)));
+                worker.others_leases = leases.sum();
+            }
+        }
+        self.was_shared = is_shared;
+        self.find_saturated(share, freed_worker);
+    }
+
+    /// Finds the workers that have enough to render of a client for a while, among all or just the
+    /// freed one.
+    fn find_saturated(&mut self, share: u64, freed_worker: Option<WorkerId>) {
         let cluster = &self.cluster;
         let roster = &cluster.roster;
         let queue_ahead = u64::from(cluster.config.queue_ahead.max(1));
         let costs = CostModel::new(&cluster.link_use, roster);
         let ahead = LendAhead::new(costs.lend_ahead_us(), roster);
         let is_enough = |id: WorkerId, w: &Worker| {
-            let regions = self.active.iter().filter_map(Frame::as_region);
+            let own = self.active.iter().filter(|f| f.share() == share);
+            let regions = own.filter_map(Frame::as_region);
             ahead.is_enough(w, regions.map(|f| f.lent_us(id)).sum(), queue_ahead)
         };
         self.cluster.saturated = match freed_worker {
@@ -529,33 +597,65 @@ impl Scheduler {
         };
     }
 
-    /// Whether the next frame may begin beside those in flight: all are of the `region` schedule
-    /// and share their bricks, and some thread has nothing more to do.
-    fn may_begin(&self) -> bool {
+    /// Returns the index of the frame in the queue that begins next; `None`: none may. Frames of one
+    /// client begin in their order, and none passes one of the `slab` schedule, which would never
+    /// find all threads free else.
+    fn next_to_begin(&self) -> Option<usize> {
+        let mut seen = BTreeSet::new();
+        for (i, job) in self.waiting.iter().enumerate() {
+            if !seen.insert(job.share) {
+                continue;
+            }
+            if self.may_begin(job) {
+                return Some(i);
+            }
+            if !uses_regions(job) {
+                break;
+            }
+        }
+        None
+    }
+
+    /// Whether a client's next frame may begin beside those in flight: all are of the `region`
+    /// schedule, and the client has none there, or its own share their bricks with it and some thread
+    /// has nothing more of the client's to do.
+    fn may_begin(&self, job: &FrameJob) -> bool {
         if self.active.is_empty() {
             return true;
         }
+        let own = self.active.iter().filter(|f| f.share() == job.share).count();
+        let by_region = uses_regions(job) && self.active.iter().all(|f| f.as_region().is_some());
+        if own == 0 || !by_region {
+            return by_region && self.active.len() < MOST_FRAMES_IN_FLIGHT;
+        }
         let is_saturated = self.cluster.link_use.is_saturated();
         let most = if is_saturated { FRAMES_ON_A_SATURATED_LINK } else { FRAMES_IN_FLIGHT };
-        if self.active.len() >= most || !self.next_overlaps() {
+        if own >= most || !self.overlaps_own(job) {
             return false;
         }
         let ahead = u64::from(self.cluster.config.queue_ahead.max(1));
-        self.cluster.roster.active().any(|(_, w)| w.leases < u64::from(w.threads) * ahead)
+        let others = |id| {
+            let others = self.active.iter().filter(|f| f.share() != job.share);
+            others.map(|f| u64::from(f.core().leases(id))).sum::<u64>()
+        };
+        let mut active = self.cluster.roster.active();
+        active.any(|(id, w)| w.leases - others(id) < u64::from(w.threads) * ahead)
     }
 
-    /// Whether the next frame in the queue can overlap those in flight.
-    fn next_overlaps(&self) -> bool {
-        let next = self.waiting.front().filter(|job| uses_regions(job));
-        let overlaps = |f: &Frame, job: &FrameJob| {
-            f.as_region().is_some_and(|f| f.core.job.scene.bricks == job.scene.bricks)
-        };
-        next.is_some_and(|job| self.active.iter().all(|f| overlaps(f, job)))
+    /// Whether a frame in the queue can overlap its client's frames in flight.
+    fn overlaps_own(&self, job: &FrameJob) -> bool {
+        let overlaps =
+            |f: &Frame| f.as_region().is_some_and(|f| f.core.job.scene.bricks == job.scene.bricks);
+        let mut own = self.active.iter().filter(|f| f.share() == job.share);
+        uses_regions(job) && own.all(overlaps)
     }
 
     /// Returns what a step of the frame at an index may do.
     fn context(&self, i: usize, may_steal: bool) -> StepContext {
-        let is_last_frame = i + 1 == self.active.len() && !self.next_overlaps();
+        let share = self.active[i].share();
+        let is_last = !self.active.range(i + 1..).any(|f| f.share() == share);
+        let next = self.waiting.iter().find(|job| job.share == share);
+        let is_last_frame = is_last && !next.is_some_and(|job| self.overlaps_own(job));
         StepContext { may_steal, is_last_frame, freed_worker: None }
     }
 
@@ -619,6 +719,20 @@ impl Scheduler {
             }
         };
         self.cluster.roster.iter().map(view).collect()
+    }
+
+    /// Returns the microseconds of render threads that a frame in flight took so far, by the results
+    /// that came; `None`: it is not in flight.
+    pub fn rendered_us(&self, frame: FrameId) -> Option<Micros> {
+        let frame = self.active.iter().find(|f| f.core().job.frame == frame)?;
+        Some(frame.core().ledger.rendered_us())
+    }
+
+    /// Returns the frame and the tile of a lease that a worker has.
+    pub fn leased(&self, worker: WorkerId, task: TaskId, epoch: Epoch) -> Option<(FrameId, Rect)> {
+        let frame = self.active.iter().find(|f| f.has_lent(worker, task, epoch))?.core();
+        let place = frame.table.queue.place(task)?;
+        Some((frame.job.frame, frame.table.tile(place)))
     }
 
     /// Returns the number of workers outside the active set ([`WorkerView::in_reserve`]).

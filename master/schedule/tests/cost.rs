@@ -60,7 +60,16 @@ fn cost(n: u32, edge: u32, height: f64, workers: u64, work: Work) -> f64 {
         bricks: set,
     });
     let count = bricks.len();
-    let job = FrameJob { frame: FrameId(1), number: 0, scene, bricks, view, work, finish: None };
+    let job = FrameJob {
+        frame: FrameId(1),
+        number: 0,
+        scene,
+        bricks,
+        view,
+        work,
+        finish: None,
+        share: 0,
+    };
 
     let clock = Wall(Instant::now());
     let mut s = Scheduler::new(Config::default());

@@ -39,7 +39,7 @@ struct AuditedJob {
 ///   sent unless memory is short;
 /// - a brick is not sent twice, not dropped under a lease, and dropped only if it was sent;
 /// - bricks under the `slab` schedule stay within the worker's memory budget;
-/// - frames end once, in their order, and never after they were cancelled;
+/// - frames end once, those of a client in their order, and never after they were cancelled;
 /// - progress is reported within bounds.
 #[derive(Default)]
 pub struct Audit {
@@ -295,7 +295,9 @@ impl Observer for Audit {
             }
             Action::FrameDone { frame, .. } => {
                 self.note("done", frame.0, 0, now);
-                let first = self.jobs.iter().find(|(_, j)| !j.is_over).map(|(f, _)| *f);
+                let share = self.jobs[frame].job.share;
+                let is_before = |j: &AuditedJob| j.job.share == share && !j.is_over;
+                let first = self.jobs.iter().find(|(_, j)| is_before(j)).map(|(f, _)| *f);
                 assert!(first.is_none_or(|f| f >= *frame), "seed {seed}: {frame} before {first:?}");
                 let j = self.jobs.get_mut(frame).expect("a frame that was queued");
                 assert!(!j.is_cancelled, "seed {seed}: {frame} was cancelled");

@@ -5,12 +5,12 @@ use crate::finish::{Assembly, FrameSums};
 use crate::finishers::FinishTask;
 use crate::jobs::{FinishedFrame, JobState};
 use crate::link::BrickOrder;
-use slabcast_common::ids::{FrameId, JobId, WorkerId};
+use slabcast_common::ids::{Epoch, FrameId, JobId, TaskId, WorkerId};
 use slabcast_common::image::{FrameState, SparseTile};
 use slabcast_common::message::ToWorker;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::stats::{FrameStats, PoisonedTile};
-use slabcast_schedule::{Action, Event as Happened, Spans, WorkerIdentity};
+use slabcast_schedule::{Action, Event as Happened, Micros, Spans, WorkerIdentity};
 use std::sync::Arc;
 use tracing::{debug, info, warn};
 
@@ -63,7 +63,7 @@ impl Driver {
                 }
                 Action::FrameTainted { frame } => {
                     // It is drawn again as if it had been dropped.
-                    let Some(Flight { job, number, .. }) = self.flights.remove(&frame) else {
+                    let Some(Flight { job, number, .. }) = self.land(frame) else {
                         continue;
                     };
                     self.jobs.lock().draw_again(job, number);
@@ -75,9 +75,36 @@ impl Driver {
                         failures, pause_ms = pause_us / 1000,
                         "worker fails again and again: it is lent nothing for a while"
                     );
+                    self.tell_pause(worker, pause_us);
                 }
             }
         }
+    }
+
+    /// Has a job's clients told that a worker refused a tile of it.
+    pub(super) fn note_refusal(&mut self, id: WorkerId, lease: (TaskId, Epoch), reason: &str) {
+        let Some((frame, tile)) = self.scheduler.leased(id, lease.0, lease.1) else { return };
+        let Some(Flight { job, number, .. }) = self.flights.get(&frame) else { return };
+        let worker =
+            self.workers.who(id).map_or_else(|| id.to_string(), |who| who.name.to_string());
+        let refusal = format!(
+            "waiting: worker {worker} refused tile {},{} of frame {number}: {}",
+            tile.x0,
+            tile.y0,
+            reason.replace(char::is_control, " ")
+        );
+        let said = format!("{refusal}; it is tried again");
+        let job = *job;
+        self.refusals.insert(id, (job, refusal));
+        self.jobs.lock().update(job, |view| view.trouble = Some(said));
+        self.jobs.ring_tile();
+    }
+
+    /// Has the clients of a job told for how long the worker is asked nothing that refused a tile.
+    fn tell_pause(&mut self, id: WorkerId, pause_us: Micros) {
+        let Some((job, refusal)) = self.refusals.get(&id) else { return };
+        let said = format!("{refusal}; it is asked again in {:.2} s", pause_us as f64 / 1e6);
+        self.jobs.lock().update(*job, |view| view.trouble = Some(said));
     }
 
     pub(super) fn progress(&mut self, frame: FrameId, tiles: (u32, u32), slab: (u32, u32)) {
@@ -90,6 +117,10 @@ impl Driver {
             span.in_scope(|| debug!(done = tiles.0, total = tiles.1, "tiles"));
         }
         self.jobs.lock().update(flight.job, |view| {
+            // A refusal is reported as progress, too.
+            if tiles.0 > 0 && (tiles != view.tiles || slab != view.slab) {
+                view.trouble = None;
+            }
             view.tiles = tiles;
             view.slab = slab;
         });
@@ -117,9 +148,11 @@ impl Driver {
         stats: Box<FrameStats>,
         spans: Spans,
     ) {
-        let Some(flight) = self.flights.get(&frame) else { return };
+        let Some(flight) = self.flights.get_mut(&frame) else { return };
+        let ms: f64 = stats.workers.iter().map(|w| w.render_ms).sum();
+        flight.took_us = Some((1e3 * ms) as u64);
         let Some(job) = self.active.get(flight.job) else {
-            self.flights.remove(&frame);
+            self.land(frame);
             return;
         };
         let sums = Box::new(FrameSums {
@@ -170,7 +203,7 @@ impl Driver {
 
     /// Fails a frame of which no worker could draw a tile; its job goes on with the others.
     fn give_up_frame(&mut self, frame: FrameId, reason: String, tile: &PoisonedTile) {
-        let Some(Flight { job, number, .. }) = self.flights.remove(&frame) else { return };
+        let Some(Flight { job, number, .. }) = self.land(frame) else { return };
         let PoisonedTile { slab, x, y, size, workers } = tile;
         warn!(
             %job, frame = number, slab, tile = format!("{x},{y}"), size,
@@ -187,7 +220,7 @@ impl Driver {
 
     pub(super) fn finished(&mut self, id: JobId, flight: FrameId, frame: FinishedFrame) {
         // A frame of a job that has ended meanwhile is nobody's.
-        let Some(flight) = self.flights.remove(&flight) else { return };
+        let Some(flight) = self.land(flight) else { return };
         flight.frame_span.in_scope(|| {
             let FrameStats { ms, pixels_sha256, .. } = &frame.stats;
             info!(ms = ms.total, pixels_sha256, "frame done");

@@ -11,6 +11,10 @@
 //! So a frame that a watcher waits for needs no memory that untaken frames hold, and goes on
 //! however many of those there are. A large frame could still wait for ever while small ones slip
 //! past it; one that has waited for [`HOLDS_BACK`] lets no other frame begin before it.
+//!
+//! Frames may take minutes, and no address is to wait for another's. So each may have one frame in
+//! flight whatever others have ([`Driver::may_fly`]), and where the budget of flights is full or held
+//! back, that one frame begins in a reserve beside it, a quarter as large.
 
 use super::{Driver, Event, Flight};
 use crate::hooks::Stage;
@@ -19,7 +23,7 @@ use crate::memory::{Shares, brick_set_bytes, making_bytes};
 use crate::panics::{Panicked, caught};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, JobId};
-use slabcast_common::link::FRAMES_IN_FLIGHT;
+use slabcast_common::link::{FRAMES_IN_FLIGHT, MOST_FRAMES_IN_FLIGHT};
 use slabcast_schedule::{Clock, Event as Happened, FrameJob, Micros};
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
@@ -29,6 +33,11 @@ use tracing::{info, warn};
 /// all others. A frame of 1024x1024 takes 0.1 s.
 const HOLDS_BACK: Micros = 1_000_000;
 
+/// Divisor of the budget of flights: the reserve beside it. A sixteenth would not take a frame of
+/// 2048x2048 of a master that may hold 2 GiB; twice as much would be bounded by nothing that is asked
+/// for at start.
+const RESERVE_DIVISOR: u64 = 4;
+
 /// Microseconds after which the driver looks again while something waits for memory that time alone
 /// sets free.
 const LOOKS_AGAIN: Micros = 200_000;
@@ -36,8 +45,10 @@ const LOOKS_AGAIN: Micros = 200_000;
 /// Memory of frames, as the rules at the head of the file see it.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Room {
-    /// Bytes of frames in the making.
+    /// Bytes of frames in the making, but for those in the reserve.
     making: u64,
+    /// Bytes of those in the reserve.
+    reserved: u64,
     /// Bytes that those which nobody waits for will have when they are finished.
     ahead: u64,
     /// Bytes of finished frames that nobody has taken.
@@ -46,15 +57,34 @@ pub(super) struct Room {
     in_hand: u64,
 }
 
+/// Where a frame may begin.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Places {
+    /// In the budget of flights.
+    main: bool,
+    /// In the reserve for addresses that have no frame in flight.
+    reserve: bool,
+}
+
 impl Room {
-    /// Whether a frame that takes `making` bytes while it is made, and `finished` bytes then, may
-    /// begin.
-    fn has(&self, shares: &Shares, wanted: bool, making: u64, finished: u64) -> bool {
-        let flies = self.making + self.in_hand + making <= shares.flights
-            || (self.making == 0 && self.in_hand <= shares.flights / 2);
+    /// Where a frame may begin that takes `making` bytes while it is made, and `finished` bytes then.
+    /// `is_only`: its address has no other in flight.
+    fn places(
+        &self,
+        shares: &Shares,
+        (wanted, is_only): (bool, bool),
+        making: u64,
+        finished: u64,
+    ) -> Places {
         let untaken = self.untaken + self.ahead;
         let ahead = untaken + finished <= shares.frames / 2 || untaken == 0;
-        flies && (wanted || ahead)
+        if !wanted && !ahead {
+            return Places::default();
+        }
+        let main = self.making + self.in_hand + making <= shares.flights
+            || (self.making == 0 && self.in_hand <= shares.flights / 2);
+        let reserve = is_only && self.reserved + making <= shares.flights / RESERVE_DIVISOR;
+        Places { main, reserve }
     }
 }
 
@@ -65,13 +95,22 @@ impl Driver {
     /// Gives the scheduler frames while there is room for them.
     pub(super) fn feed(&mut self) {
         self.look_again_at = None;
-        while self.flights.len() < FRAMES_IN_FLIGHT {
-            let Some(candidate) = self.pick() else { break };
-            if !self.begin(candidate) {
+        while self.flights.len() < MOST_FRAMES_IN_FLIGHT {
+            let Some((candidate, in_reserve)) = self.pick() else { break };
+            if !self.begin(candidate, in_reserve) {
                 break;
             }
         }
         self.cut_next();
+    }
+
+    /// Takes a frame out of those in flight, and charges its client with what it took. `None`: it is
+    /// not among them.
+    pub(super) fn land(&mut self, frame: FrameId) -> Option<Flight> {
+        let flight = self.flights.remove(&frame)?;
+        let took_us = flight.took_us.or_else(|| self.scheduler.rendered_us(frame)).unwrap_or(0);
+        self.active.ended(flight.job, flight.making_bytes, took_us);
+        Some(flight)
     }
 
     fn candidates(&self) -> Vec<Candidate> {
@@ -84,11 +123,18 @@ impl Driver {
     fn room(&self) -> Room {
         let table = self.jobs.lock();
         Room {
-            making: self.flights.values().map(|f| f.making_bytes).sum(),
+            making: self.making_bytes(false),
+            reserved: self.making_bytes(true),
             ahead: self.flights.values().filter(|f| !f.wanted).map(|f| f.finished_bytes).sum(),
             untaken: table.untaken_bytes() as u64,
             in_hand: table.in_hand_bytes() as u64,
         }
+    }
+
+    /// Bytes of the frames in flight that are in the reserve, or of all others.
+    fn making_bytes(&self, in_reserve: bool) -> u64 {
+        let flights = self.flights.values().filter(|f| f.in_reserve == in_reserve);
+        flights.map(|f| f.making_bytes).sum()
     }
 
     /// Returns the memory of a frame in bytes, while it is rendered and when it is finished.
@@ -98,28 +144,47 @@ impl Driver {
         (making_bytes(&job.request), w * h * job.request.format.bytes() as u64)
     }
 
-    /// Whether there is room for a frame.
-    fn has_room(&self, room: &Room, candidate: &Candidate) -> bool {
+    /// Where there is room for a frame.
+    fn places(&self, room: &Room, candidate: &Candidate) -> Places {
         let (making, finished) = self.bytes_of(candidate);
-        room.has(&self.shares, candidate.wanted, making, finished)
+        let share = self.active.share(candidate.job);
+        let is_only = self.flights.values().all(|f| f.share != share);
+        room.places(&self.shares, (candidate.wanted, is_only), making, finished)
     }
 
-    /// The frame that begins next.
-    fn pick(&mut self) -> Option<Candidate> {
+    /// Whether a frame may begin beside those in flight: there are fewer than [`FRAMES_IN_FLIGHT`] and
+    /// its address has none of another brick set, for which it would only wait; or the address has
+    /// none at all. So no address keeps others waiting by frames that take minutes.
+    fn may_fly(&self, candidate: &Candidate) -> bool {
+        let Some(job) = self.active.get(candidate.job) else { return false };
+        let share = self.active.share(candidate.job);
+        let mut own = self.flights.values().filter(|f| f.share == share).peekable();
+        if own.peek().is_none() {
+            return self.flights.len() < MOST_FRAMES_IN_FLIGHT;
+        }
+        self.flights.len() < FRAMES_IN_FLIGHT && own.all(|f| f.scene.bricks == job.scene.bricks)
+    }
+
+    /// The frame that begins next, and whether in the reserve.
+    fn pick(&mut self) -> Option<(Candidate, bool)> {
         let now = self.clock.now();
         let room = self.room();
         let mut first_blocked = None;
-        let mut picked = None;
+        let (mut picked, mut spare) = (None, None);
         for candidate in self.candidates() {
             let Some(job) = self.active.get(candidate.job) else { continue };
-            if self.brick_sets.get(job.scene.bricks).is_none() {
+            if self.brick_sets.get(job.scene.bricks).is_none() || !self.may_fly(&candidate) {
                 continue;
             }
-            if self.has_room(&room, &candidate) {
-                picked = Some(candidate);
+            let Places { main, reserve } = self.places(&room, &candidate);
+            if reserve {
+                spare.get_or_insert((candidate, true));
+            }
+            if main {
+                picked = Some((candidate, false));
                 break;
             }
-            if candidate.wanted && first_blocked.is_none() {
+            if candidate.wanted && !reserve && first_blocked.is_none() {
                 first_blocked = Some((candidate.job, candidate.number));
             }
         }
@@ -127,9 +192,9 @@ impl Driver {
             Some(before @ (j, n, _)) if (j, n) == (job, number) => before,
             _ => (job, number, now),
         });
-        let Some((_, _, since)) = self.blocked else { return picked };
+        let Some((_, _, since)) = self.blocked else { return picked.or(spare) };
         self.look_again_at = Some(now + LOOKS_AGAIN);
-        picked.filter(|_| now < since + HOLDS_BACK)
+        picked.filter(|_| now < since + HOLDS_BACK).or(spare)
     }
 
     /// Fails a frame whose camera has no meaning.
@@ -143,7 +208,7 @@ impl Driver {
     }
 
     /// Begins a frame, or fails it. Returns false if neither can be done now.
-    fn begin(&mut self, candidate: Candidate) -> bool {
+    fn begin(&mut self, candidate: Candidate, in_reserve: bool) -> bool {
         let Candidate { job: id, number, wanted } = candidate;
         let (making_bytes, finished_bytes) = self.bytes_of(&candidate);
         let Some(job) = self.active.get_mut(id) else { return false };
@@ -159,13 +224,16 @@ impl Driver {
         if number == job.next || (!wanted && number > job.next) {
             job.next = number + 1;
         }
-        let Some(job) = self.active.begun(id, making_bytes) else { return false };
+        let is_first = job.begun == 0;
+        self.active.begun(id, making_bytes);
         self.jobs.lock().begins(id, number);
         // Frames that were taken make place for this one.
-        let making: u64 = self.flights.values().map(|f| f.making_bytes).sum();
-        let kept = self.shares.frames.saturating_sub(making + making_bytes);
+        let making = self.making_bytes(false) + if in_reserve { 0 } else { making_bytes };
+        let kept = self.shares.frames.saturating_sub(making);
         self.jobs.lock().evict(kept as usize, None);
         self.last_frame_id += 1;
+        let share = self.active.share(id);
+        let Some(job) = self.active.get(id) else { return false };
         let frame = FrameId(self.last_frame_id);
         let frame_span = tracing::info_span!("frame", job = %id, number, id = %frame);
         let scene = job.scene_of(number, frame);
@@ -176,8 +244,11 @@ impl Driver {
             view,
             store: store.clone(),
             wanted,
+            share,
+            in_reserve,
             making_bytes,
             finished_bytes,
+            took_us: None,
             frame_span,
             slab_span: None,
             assembly: None,
@@ -192,12 +263,17 @@ impl Driver {
             view,
             work: job.request.work,
             finish: (!job.request.want_hash).then(|| job.request.encoding()),
+            share,
         };
         self.brick_sets.used(store.key());
         self.scheduler.handle(&self.clock, Happened::FrameQueued(Box::new(queued)));
         if let Some(scene) = own_scene {
             // It ends with its frame.
             self.scheduler.handle(&self.clock, Happened::SceneEnded { scene });
+        }
+        if is_first {
+            // It is no longer queued.
+            self.refresh_states();
         }
         true
     }
@@ -210,7 +286,8 @@ impl Driver {
             return;
         }
         let room = self.room();
-        let able = self.candidates().into_iter().filter(|c| self.has_room(&room, c));
+        let able = self.candidates().into_iter();
+        let able = able.filter(|c| self.may_fly(c) && self.places(&room, c) != Places::default());
         let mut comes_first = true;
         let lacking = able.filter_map(|c| self.active.get(c.job)).find(|job| {
             let lacks = self.brick_sets.get(job.scene.bricks).is_none();
@@ -282,21 +359,44 @@ mod tests {
     const SHARES: Shares =
         Shares { frames: 100, flights: 100, largest_frame: None, bricks: 0, requests: 0 };
 
+    /// Whether there is room in the budget for a frame of an address that has others in flight.
+    fn has(room: &Room, wanted: bool, making: u64, finished: u64) -> bool {
+        room.places(&SHARES, (wanted, false), making, finished).main
+    }
+
     #[test]
     fn frame_that_is_waited_for_needs_no_memory_of_untaken_frames() {
         let full = Room { untaken: 1000, ..Room::default() };
-        assert!(full.has(&SHARES, true, 30, 10) && !full.has(&SHARES, false, 30, 10));
+        assert!(has(&full, true, 30, 10) && !has(&full, false, 30, 10));
         let half = Room { untaken: 30, ahead: 10, ..Room::default() };
-        assert!(half.has(&SHARES, false, 30, 10) && !half.has(&SHARES, false, 30, 11));
+        assert!(has(&half, false, 30, 10) && !has(&half, false, 30, 11));
     }
 
     #[test]
     fn frames_in_the_making_share_one_budget_and_one_alone_may_be_larger() {
         let one = Room { making: 60, ..Room::default() };
-        assert!(one.has(&SHARES, true, 40, 1) && !one.has(&SHARES, true, 41, 1));
+        assert!(has(&one, true, 40, 1) && !has(&one, true, 41, 1));
         let none = Room::default();
-        assert!(none.has(&SHARES, true, 1 << 40, 1) && none.has(&SHARES, false, 1 << 40, 1 << 40));
+        assert!(has(&none, true, 1 << 40, 1) && has(&none, false, 1 << 40, 1 << 40));
         let held = Room { in_hand: 51, ..Room::default() };
-        assert!(!held.has(&SHARES, true, 1 << 40, 1), "what watchers hold counts");
+        assert!(!has(&held, true, 1 << 40, 1), "what watchers hold counts");
+    }
+
+    #[test]
+    fn address_without_a_frame_in_flight_has_a_reserve_beside_a_full_budget() {
+        let full = Room { making: 1 << 40, in_hand: 1 << 40, ..Room::default() };
+        let places = |room: &Room, wanted, is_only, making| {
+            let Places { main, reserve } = room.places(&SHARES, (wanted, is_only), making, 1);
+            (main, reserve)
+        };
+        assert_eq!(places(&full, true, true, 25), (false, true));
+        assert_eq!(places(&full, true, false, 25), (false, false), "it has others");
+        assert_eq!(places(&full, true, true, 26), (false, false), "it is larger");
+        let used = Room { reserved: 20, ..full };
+        assert_eq!(places(&used, true, true, 5), (false, true));
+        assert_eq!(places(&used, true, true, 6), (false, false), "others use it");
+        // What is in the reserve holds up no frame that is larger than the budget.
+        let alone = Room { reserved: 20, ..Room::default() };
+        assert_eq!(places(&alone, true, true, 1 << 40), (true, false));
     }
 }

@@ -88,7 +88,7 @@ impl Driver {
         let frames: Vec<FrameId> =
             self.flights.iter().filter(|(_, f)| f.job == id).map(|(frame, _)| *frame).collect();
         for frame in frames {
-            self.flights.remove(&frame);
+            self.land(frame);
             self.scheduler.handle(&self.clock, Happened::CancelFrame { frame });
         }
         // In this order: a watcher ends at what it finds of a job that is retired.

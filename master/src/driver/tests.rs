@@ -59,6 +59,23 @@ fn join_unless(
     pings: Arc<AtomicUsize>,
     refuses: impl Fn(FrameId) -> bool + Send + 'static,
 ) {
+    join_that(handle, pings, move |frame| if refuses(frame) { Does::Refuses } else { Does::Draws });
+}
+
+/// What a worker does with a tile.
+enum Does {
+    Draws,
+    Refuses,
+    /// Draws for ever.
+    NeverEnds,
+}
+
+/// A worker as [`join`] has it, which does with tiles what `does` says for their frames.
+fn join_that(
+    handle: &Handle,
+    pings: Arc<AtomicUsize>,
+    does: impl Fn(FrameId) -> Does + Send + 'static,
+) {
     let mut end = crate::link::embedded(handle.clone());
     tokio::spawn(async move {
         let hello = Hello {
@@ -76,12 +93,18 @@ fn join_unless(
         let _ = end.replies.send(ToMaster::Hello(hello)).await;
         while let Some(message) = end.control.recv().await {
             let reply = match message {
-                ToWorker::Region(lease) if refuses(lease.frame) => ToMaster::Failed {
-                    task: lease.task,
-                    epoch: lease.epoch,
-                    reason: "out of\n\x1b[31mmemory".into(),
-                },
                 ToWorker::Region(lease) => {
+                    match does(lease.frame) {
+                        Does::Draws => {}
+                        Does::NeverEnds => continue,
+                        Does::Refuses => {
+                            let (task, epoch) = (lease.task, lease.epoch);
+                            let reason = "out of\n\x1b[31mmemory".into();
+                            let _ =
+                                end.replies.send(ToMaster::Failed { task, epoch, reason }).await;
+                            continue;
+                        }
+                    }
                     let n = lease.tile.area();
                     let pixels =
                         TilePixels { a: vec![0.0; n], colour: vec![[0; 3]; n], last: None };
@@ -522,6 +545,67 @@ async fn addresses_share_the_work_whatever_the_number_of_their_jobs() {
     let other = since.next().expect("five jobs");
     assert!(one.abs_diff(other) < 30, "{one} frames of four jobs, {other} of one");
     jobs.iter().for_each(|job| drop(handle.cancel(*job)));
+    master.shutdown().await;
+}
+
+/// One address has as many frames in flight as it may, and none of them ever ends.
+#[tokio::test]
+async fn frames_of_an_address_that_never_end_keep_no_other_address_waiting() {
+    let master = master(Hooks::default(), 100_000);
+    let handle = master.handle();
+    join_that(&handle, Arc::default(), |frame| match frame.0 <= 4 {
+        true => Does::NeverEnds,
+        false => Does::Draws,
+    });
+    let greedy = Some([10, 0, 0, 1].into());
+    let mut jobs = Vec::new();
+    // More functions than brick sets are kept.
+    for preset in ["grey", "fog", "peer-opaque", "peer-semi"] {
+        let job = handle.submit_from(request(preset, 9, preset), greedy).await.expect("good");
+        jobs.push(job);
+    }
+    let watching = handle.clone();
+    let first = jobs[0];
+    tokio::spawn(async move { watched(&watching, first).await });
+    while handle.job(first).expect("it is there").state != JobState::Running {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    for (key, preset) in [("x", "grey"), ("y", "peer-opaque"), ("z", "auto")] {
+        let other = Some([10, 0, 0, 2].into());
+        let job = handle.submit_from(request(key, 3, preset), other).await.expect("good");
+        let ended = tokio::time::timeout(Duration::from_secs(20), watched(&handle, job)).await;
+        assert_eq!(ended.expect("in time"), (JobState::Done, 3), "{preset}");
+    }
+    assert_eq!(handle.job(first).expect("it is there").frames_done, 0);
+    for job in jobs {
+        assert!(handle.cancel(job).await);
+    }
+    master.shutdown().await;
+}
+
+/// A job whose only worker refuses all says so while it waits, and no longer once a tile is drawn.
+#[tokio::test]
+async fn job_whose_worker_refuses_tiles_says_that_and_not_that_others_come_first() {
+    let master = master(Hooks::default(), 100_000);
+    let handle = master.handle();
+    let is_sick = Arc::new(AtomicUsize::new(1));
+    let sick = is_sick.clone();
+    join_unless(&handle, Arc::default(), move |_| sick.load(Ordering::Relaxed) == 1);
+    let job = handle.submit(request("a", 1, "grey")).await.expect("a good request");
+    let said = || crate::serve::notice(&handle.job(job).expect("it is there"));
+    while !said().message.contains("asked again") {
+        assert_ne!(said().state, slabcast_proto::model::JobState::Failed);
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    let notice = said();
+    assert_eq!(notice.state, slabcast_proto::model::JobState::Running);
+    let begins = "waiting: worker clear refused tile ";
+    assert!(notice.message.starts_with(begins), "{}", notice.message);
+    let reason = " of frame 0: out of  [31mmemory; it is asked again in ";
+    assert!(notice.message.contains(reason), "{}", notice.message);
+    is_sick.store(0, Ordering::Relaxed);
+    assert_eq!(watched(&handle, job).await, (JobState::Done, 1));
+    assert!(!said().message.contains("refused"), "{}", said().message);
     master.shutdown().await;
 }
 

@@ -70,17 +70,36 @@ impl ActiveJob {
 pub(crate) struct ActiveJobs {
     by_id: BTreeMap<JobId, ActiveJob>,
     order: VecDeque<JobId>,
-    /// Addresses that jobs came from (`None`: this process), and the work of their frames that were
-    /// begun. An address that comes anew begins where the least of the others is, so that it is
-    /// served at once and has no claim on the past.
-    peers: BTreeMap<Option<IpAddr>, u64>,
+    /// Addresses that jobs came from (`None`: this process). One that comes anew begins with the work
+    /// of the one that has least, so that it is served at once and has no claim on the past.
+    peers: BTreeMap<Option<IpAddr>, Peer>,
     peer_of: BTreeMap<JobId, Option<IpAddr>>,
+    last_share: u64,
+}
+
+/// An address with jobs.
+#[derive(Clone, Copy, Debug)]
+struct Peer {
+    /// Its number for the scheduler and the workers.
+    share: u64,
+    /// Microseconds of render threads that its frames took, by measurement; of those that are not
+    /// done, by a guess from their size.
+    work_us: u64,
+}
+
+/// Returns the microseconds of render threads that a frame is taken for before it is done: one for
+/// each KiB that it takes while it is made. A small frame is work, too.
+fn guessed_us(making_bytes: u64) -> u64 {
+    1000 + making_bytes / 1024
 }
 
 impl ActiveJobs {
     pub(crate) fn insert(&mut self, id: JobId, job: ActiveJob, peer: Option<IpAddr>) {
-        let least = self.peers.values().copied().min().unwrap_or(0);
-        self.peers.entry(peer).or_insert(least);
+        let least = self.peers.values().map(|peer| peer.work_us).min().unwrap_or(0);
+        self.peers.entry(peer).or_insert_with(|| {
+            self.last_share += 1;
+            Peer { share: self.last_share, work_us: least }
+        });
         self.peer_of.insert(id, peer);
         self.by_id.insert(id, job);
         self.order.push_back(id);
@@ -109,15 +128,29 @@ impl ActiveJobs {
     }
 
     /// Notes that a frame of a job was begun, which takes so many bytes while it is made.
-    /// Returns the job.
-    pub(crate) fn begun(&mut self, id: JobId, making_bytes: u64) -> Option<&ActiveJob> {
-        self.by_id.get_mut(&id)?.begun += 1;
-        let peer = self.peer_of.get(&id).and_then(|peer| self.peers.get_mut(peer));
-        if let Some(work) = peer {
-            // A small frame is work, too.
-            *work += making_bytes + (1 << 20);
+    pub(crate) fn begun(&mut self, id: JobId, making_bytes: u64) {
+        if let Some(job) = self.by_id.get_mut(&id) {
+            job.begun += 1;
         }
-        self.by_id.get(&id)
+        let peer = self.peer_of.get(&id).and_then(|peer| self.peers.get_mut(peer));
+        if let Some(peer) = peer {
+            peer.work_us += guessed_us(making_bytes);
+        }
+    }
+
+    /// Notes that a frame ended, in whatever way, that was begun with so many bytes and took so many
+    /// microseconds of render threads.
+    pub(crate) fn ended(&mut self, id: JobId, making_bytes: u64, took_us: u64) {
+        let peer = self.peer_of.get(&id).and_then(|peer| self.peers.get_mut(peer));
+        if let Some(peer) = peer {
+            let guessed = guessed_us(making_bytes);
+            peer.work_us = peer.work_us.saturating_sub(guessed).saturating_add(took_us.max(1000));
+        }
+    }
+
+    /// Returns the number of the address that a job came from.
+    pub(crate) fn share(&self, id: JobId) -> u64 {
+        self.peer_of.get(&id).and_then(|peer| self.peers.get(peer)).map_or(0, |peer| peer.share)
     }
 
     /// Ids, oldest first.
@@ -132,7 +165,7 @@ impl ActiveJobs {
     }
 
     /// The frame that each job would begin next: one that a watcher waits for, or else the next that
-    /// was never rendered. Jobs of the address of which least was drawn come first, and among its
+    /// was never rendered. Jobs of the address that took least time come first, and among its
     /// jobs those in earlier turns. Within a turn, frames that are waited for come first, and older
     /// jobs. `is_in_flight` tells of frames that are being rendered.
     pub(crate) fn candidates(
@@ -152,7 +185,8 @@ impl ActiveJobs {
         };
         let jobs = self.order.iter().filter_map(|&id| {
             let active = self.by_id.get(&id)?;
-            let work = self.peer_of.get(&id).and_then(|peer| self.peers.get(peer)).copied();
+            let peer = self.peer_of.get(&id).and_then(|peer| self.peers.get(peer));
+            let work = peer.map(|peer| peer.work_us);
             Some(((work, active.turn()), next(id, active)?))
         });
         let mut candidates: Vec<((Option<u64>, u32), Candidate)> = jobs.collect();

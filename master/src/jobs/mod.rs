@@ -105,6 +105,8 @@ pub struct JobView {
     pub tiles: (u32, u32),
     /// Current slab, counted from 0, and number of slabs of the current frame.
     pub slab: (u32, u32),
+    /// Why it stands still, if its last news is that a worker refused a tile.
+    pub trouble: Option<String>,
     /// Number of workers that are linked to the master.
     pub workers: u32,
     /// Width and height of the pictures, in pixels.

@@ -178,6 +178,7 @@ impl Plan {
                 frames_total: self.views.len(),
                 tiles: (0, 0),
                 slab: (0, 0),
+                trouble: None,
                 workers: 0,
                 size: request.path.size,
                 format: request.format,

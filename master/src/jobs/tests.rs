@@ -71,6 +71,7 @@ fn job(id: JobId, frames: u64) -> Job {
         frames_total: frames,
         tiles: (0, 0),
         slab: (0, 0),
+        trouble: None,
         workers: 1,
         size: [1, 1],
         format: PixelFormat::Rgb8,

@@ -143,6 +143,13 @@ struct NotedJob {
     /// Format and background for regions that are finished on workers.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     finish: Option<PixelEncoding>,
+    /// Number of the client; 0 where all frames are one client's.
+    #[serde(default, skip_serializing_if = "is_nobody")]
+    share: u64,
+}
+
+fn is_nobody(share: &u64) -> bool {
+    *share == 0
 }
 
 #[derive(Debug, Serialize, Deserialize)]

@@ -99,6 +99,9 @@ pub fn notice(job: &JobView) -> JobNotice {
             job.tiles.1
         );
     }
+    if let Some(trouble) = job.trouble.as_ref().filter(|_| state == model::JobState::Running) {
+        message.clone_from(trouble);
+    }
     JobNotice {
         state,
         frames_done: job.frames_done,

@@ -1,5 +1,6 @@
 //! Drawing one task on one render thread.
 
+use super::queue::Turn;
 use super::task::{
     DrawnRegion, Progress, RegionReport, RegionTask, SlabReport, SlabTask, StoppableSupply,
 };
@@ -54,12 +55,13 @@ pub(super) fn draw_slab(
     SlabReport { lease, received, ready, start, end, thread, outcome }
 }
 
-/// Draws a region as far as its bricks are here. `give` is handed each piece that is split off.
+/// Draws a region as far as its bricks are here and its client's turn lasts. `give` is handed each piece that is split off.
 pub(super) fn draw_region(
     thread: u32,
     simd: Simd,
     mut task: Box<RegionTask>,
     scratch: &mut Scratch,
+    turn: &Turn<'_>,
     give: &dyn Fn(RegionSplit),
 ) -> RegionReport {
     let span = tracing::debug_span!(
@@ -70,7 +72,7 @@ pub(super) fn draw_region(
     let progress = if task.frame.has_ended.load(Ordering::Relaxed) {
         Progress::FrameEnded
     } else {
-        caught(scratch, |scratch| advance(simd, &mut task, scratch, give))
+        caught(scratch, |scratch| advance(simd, &mut task, scratch, turn, give))
             .unwrap_or_else(Progress::Failed)
     };
     RegionReport { task, end: Instant::now(), thread, progress }
@@ -80,6 +82,7 @@ fn advance(
     simd: Simd,
     task: &mut RegionTask,
     scratch: &mut Scratch,
+    turn: &Turn<'_>,
     give: &dyn Fn(RegionSplit),
 ) -> Progress {
     let RegionTask { lease, frame: slot, table, split, drawn, region, ahead, .. } = task;
@@ -99,7 +102,7 @@ fn advance(
             },
         }),
     };
-    let supply = StoppableSupply { table, split };
+    let supply = StoppableSupply { table, split, has_ended: &slot.has_ended, turn };
     let missing = loop {
         let missing = current.advance(frame, simd, visible, &supply, *ahead, scratch);
         let Some(share) = split.take().filter(|_| current.depth().is_some()) else {
@@ -118,6 +121,12 @@ fn advance(
     if !missing.is_empty() {
         let is_deeper = current.depth() != depth_before;
         return Progress::Stalled { missing, is_deeper };
+    }
+    if slot.has_ended.load(Ordering::Relaxed) {
+        return Progress::FrameEnded;
+    }
+    if current.depth().is_some() {
+        return Progress::GaveWay;
     }
     let Some(region) = region.take() else { return Progress::FrameEnded };
     let finishing = Instant::now();

@@ -1,8 +1,10 @@
 //! Render threads. They take tasks from one queue and hand reports back; they know nothing of
 //! links.
 //!
-//! The queue is in the order of frames, since a late frame holds up those behind it; in a frame, a
-//! region that goes on comes before one that begins. Before a thread draws a task it looks at the
+//! Clients take turns: the one that had least time of the threads comes next, and a region that
+//! takes long gives way between two sheets. A client's tasks are in the order of frames, since a
+//! late frame holds up those behind it; in a frame, a region that goes on comes before one that
+//! begins. Before a thread draws a task it looks at the
 //! regions that came into the queue meanwhile: bricks that they will need, judged by earlier
 //! frames, are asked for at once and travel while other tasks are drawn (prefetch).
 
@@ -20,7 +22,7 @@ pub(crate) use task::{
 use crate::brick_table::BrickTable;
 use crate::rehearse::Rehearsal;
 use draw::{caught, draw_region, draw_slab};
-use queue::{Prefetch, Queue};
+use queue::{Prefetch, Queue, Turn};
 use slabcast_render::Simd;
 use slabcast_render::region;
 use slabcast_render::tile::Scratch;
@@ -92,13 +94,21 @@ fn draw(thread: u32, simd: Simd, queue: &Queue, reports: &mpsc::UnboundedSender<
             // A region over which this fails will fail when it is drawn, and say so.
             report_prefetch(&frame, table, places.unwrap_or_default(), reports);
         }
+        let turn = Turn::new(queue, task.share());
         let report = match task {
             Task::Slab(task) => Report::Slab(draw_slab(thread, simd, task, &mut scratch)),
             Task::Region(task) => {
                 let give = |piece| drop(reports.send(Report::Piece(Box::new(piece))));
-                Report::Region(draw_region(thread, simd, task, &mut scratch, &give))
+                let report = draw_region(thread, simd, task, &mut scratch, &turn, &give);
+                if matches!(report.progress, Progress::GaveWay) {
+                    queue.push(Task::Region(report.task));
+                    turn.end();
+                    continue;
+                }
+                Report::Region(report)
             }
         };
+        turn.end();
         if reports.send(report).is_err() {
             return;
         }
@@ -134,6 +144,7 @@ fn rehearse(
         // Either the task waited for the thread, or the thread for the task.
         let came = Instant::now();
         let begin = if came - asked < AT_ONCE { free } else { free.max(came) };
+        let turn = Turn::new(queue, task.share());
         for Prefetch { frame, table, tile } in prefetches {
             let places = rehearsal.expected(&frame, &table, tile);
             report_prefetch(&frame, table, places, reports);
@@ -164,6 +175,7 @@ fn rehearse(
                 Report::Region(RegionReport { task, end, thread, progress })
             }
         };
+        turn.end();
         if reports.send(report).is_err() {
             return;
         }

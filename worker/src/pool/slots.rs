@@ -44,6 +44,8 @@ pub(crate) struct FrameSlot {
     pub(crate) finish: Option<PixelEncoding>,
     /// Whether results are sent as they are, not packed (rehearsal only).
     pub(crate) plain: bool,
+    /// Whose frame it is: clients have equal shares of the threads.
+    pub(crate) share: u64,
     frame: OnceLock<Frame>,
     probe: OnceLock<ErrorProbe>,
     visible: OnceLock<VisibleBricks>,
@@ -54,7 +56,8 @@ pub(crate) struct FrameSlot {
     pub(crate) made: OnceLock<Instant>,
     /// Blocks of bricks that its tiles opened (rehearsal only).
     pub(crate) held: Mutex<BTreeSet<u32>>,
-    /// Whether the master has ended the frame: its tasks that have not begun are dropped.
+    /// Whether the master has ended the frame: its tasks are dropped, regions that are being drawn
+    /// at their next sheet.
     pub(crate) has_ended: AtomicBool,
 }
 
@@ -64,6 +67,7 @@ impl FrameSlot {
         view: View,
         finish: Option<PixelEncoding>,
         plain: bool,
+        share: u64,
     ) -> Self {
         let (frame, probe, visible, depths, rehearsed, made, held, has_ended) = Default::default();
         FrameSlot {
@@ -71,6 +75,7 @@ impl FrameSlot {
             view,
             finish,
             plain,
+            share,
             frame,
             probe,
             visible,

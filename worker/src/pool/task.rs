@@ -1,5 +1,6 @@
 //! Tasks of render threads, and their reports.
 
+use super::queue::Turn;
 use super::slots::FrameSlot;
 use crate::brick_table::BrickTable;
 use slabcast_common::brick::{Brick, BrickSetKey};
@@ -8,7 +9,7 @@ use slabcast_common::message::{Counters, ErrorsBySource, Lease, Pixels, RegionLe
 use slabcast_render::region::{BrickSupply, Region};
 use slabcast_trace::RegionProgress;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 /// A tile of one slab whose bricks are all here (`slab` schedule).
@@ -53,10 +54,13 @@ impl SplitRequest {
     }
 }
 
-/// The bricks of a table, until the region that draws from it is to be split.
+/// The bricks of a table, until the region that draws from it is to be split, its frame has ended, or
+/// another client's turn has come.
 pub(super) struct StoppableSupply<'a> {
     pub(super) table: &'a BrickTable,
     pub(super) split: &'a SplitRequest,
+    pub(super) has_ended: &'a AtomicBool,
+    pub(super) turn: &'a Turn<'a>,
 }
 
 impl BrickSupply for StoppableSupply<'_> {
@@ -69,7 +73,7 @@ impl BrickSupply for StoppableSupply<'_> {
     }
 
     fn stops(&self) -> bool {
-        self.split.is_pending()
+        self.split.is_pending() || self.has_ended.load(Ordering::Relaxed) || self.turn.is_over()
     }
 }
 
@@ -145,6 +149,8 @@ pub(crate) struct DrawnRegion {
 pub(crate) enum Progress {
     /// The frame had ended.
     FrameEnded,
+    /// To a sheet at which another client's turn came: it is drawn on when its own turn comes.
+    GaveWay,
     /// To its end.
     Done(Box<DrawnRegion>),
     /// To a sheet at which it lacks bricks.
@@ -170,6 +176,16 @@ pub(crate) struct RegionReport {
 pub(crate) enum Task {
     Slab(SlabTask),
     Region(Box<RegionTask>),
+}
+
+impl Task {
+    /// Whose frame it is of.
+    pub(super) fn share(&self) -> u64 {
+        match self {
+            Task::Slab(task) => task.frame.share,
+            Task::Region(task) => task.frame.share,
+        }
+    }
 }
 
 /// A report of a render thread.

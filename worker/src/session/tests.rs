@@ -77,7 +77,7 @@ impl World {
         world.known = Some((spec.clone(), view));
         world.say(ToWorker::Scene(Arc::new(spec)));
         for (frame, finish) in [(FRAME, None), (FINISHED, Some(FINISH))] {
-            world.say(ToWorker::Frame { frame, scene: id, view, finish, plain: false });
+            world.say(ToWorker::Frame { frame, scene: id, view, finish, plain: false, share: 0 });
         }
         world
     }
@@ -249,7 +249,7 @@ async fn prefetch_requests_bricks_before_their_region_is_begun() {
     let spec = SceneSpec { id: SceneId(4), quality, ..known };
     let (scene, finish) = (spec.id, None);
     world.say(ToWorker::Scene(Arc::new(spec)));
-    world.say(ToWorker::Frame { frame, scene, view, finish, plain: false });
+    world.say(ToWorker::Frame { frame, scene, view, finish, plain: false, share: 0 });
     world.send(1).await;
     let tile = Rect::new(0, 0, 32, 32);
     world.region_of(frame, 1, tile);
@@ -290,7 +290,7 @@ async fn lookahead_grows_while_render_threads_wait_for_bricks() {
     let (scene, finish) = (spec.id, None);
     world.say(ToWorker::Scene(Arc::new(spec)));
     for frame in [FrameId(9), FrameId(10)] {
-        world.say(ToWorker::Frame { frame, scene, view, finish, plain: false });
+        world.say(ToWorker::Frame { frame, scene, view, finish, plain: false, share: 0 });
     }
     let bricks_of = |heard| match heard {
         ToMaster::BricksWanted { bricks, .. } => bricks.iter().map(|b| b.0).collect::<Vec<_>>(),
@@ -498,4 +498,78 @@ async fn master_that_is_silent_for_three_heartbeats_is_given_up() {
         world;
     let Ended::Lost(reason) = ended.await.unwrap().unwrap() else { panic!("lost") };
     assert!(reason.contains("silent"), "{reason}");
+}
+
+/// Announces frames of client 1, each of more sheets than the one before, until the region of one
+/// takes long. Returns that frame, its tile and the region's result.
+async fn long_region(world: &mut World) -> (FrameId, Rect, Box<TileResult>) {
+    world.directory();
+    world.send(0).await;
+    world.send(1).await;
+    let (known, _) = world.known.clone().expect("a scene");
+    let size = [64, 64];
+    let tile = Rect::from_size(size);
+    for n in 2..=6 {
+        let thickness = 0.5f64.powi(n);
+        let quality = Quality { cull: false, eps: 0.0, thickness, ..known.quality };
+        let path = ViewPath::from_turntable(size, Turntable::default());
+        let orientation = Orientation::new(None, None).unwrap();
+        let camera = path.camera(0, &known.volume.lattice, orientation).unwrap();
+        let view = View::new(&known.volume.lattice, &camera, size, &quality).unwrap();
+        let spec = SceneSpec { id: SceneId(100 + n as u64), quality, ..known.clone() };
+        let (frame, scene, finish) = (FrameId(100 + n as u64), spec.id, None);
+        world.say(ToWorker::Scene(Arc::new(spec)));
+        world.say(ToWorker::Frame { frame, scene, view, finish, plain: false, share: 1 });
+        world.region_of(frame, 1, tile);
+        let result = world.result().await;
+        if result.times.end_us - result.times.start_us > 150_000 || n == 6 {
+            return (frame, tile, result);
+        }
+    }
+    unreachable!("the last one returns");
+}
+
+/// Clients take turns: one's region gives way at a sheet, and goes on from there.
+#[tokio::test]
+async fn region_of_a_client_is_drawn_beside_a_long_one_of_another_with_the_same_pixels() {
+    let mut world = World::new().await;
+    let (long, tile, alone) = long_region(&mut world).await;
+    let alone_us = alone.times.end_us - alone.times.start_us;
+    assert!(alone_us > 60_000, "it has to last several turns: {alone_us} us");
+
+    let began = Instant::now();
+    world.region_of(long, 2, tile);
+    world.settle().await;
+    let mut before = 0;
+    let beside = loop {
+        // Of another client's frame.
+        world.region_of(FRAME, 10 + before, Rect::new(0, 0, 32, 32));
+        let result = world.result().await;
+        if result.task == TaskId(2) {
+            break result;
+        }
+        before += 1;
+    };
+    let took = began.elapsed();
+    assert!(before >= 2, "{before} regions were drawn meanwhile, in {took:?}");
+    assert_eq!(sums(&beside), sums(&alone), "as if it had never given way");
+    assert_eq!(beside.region.map(|c| c.touched), alone.region.map(|c| c.touched));
+}
+
+#[tokio::test]
+async fn region_that_is_being_drawn_ends_with_its_frame() {
+    let mut world = World::new().await;
+    let (long, tile, alone) = long_region(&mut world).await;
+    let alone_us = alone.times.end_us - alone.times.start_us;
+
+    world.region_of(long, 2, tile);
+    world.settle().await;
+    // Nobody else is there to whom it would give way.
+    world.say(ToWorker::EndFrame { frame: long });
+    let ended = Instant::now();
+    world.stop.send(true).unwrap();
+    assert!(matches!(world.hear().await, ToMaster::Goodbye { .. }));
+    assert_eq!(world.ended.await.unwrap().unwrap(), Ended::Stopped);
+    let took = ended.elapsed();
+    assert!(took.as_micros() < u128::from(alone_us) / 4, "{took:?}; alone {alone_us} us");
 }

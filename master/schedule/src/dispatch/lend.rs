@@ -10,7 +10,6 @@
 //!
 //! Then leases leave, each worker's together, with the bricks that their tiles used before.
 
-use crate::Micros;
 use crate::state::brick_orders::send_bricks;
 use crate::state::cluster::Cluster;
 use crate::state::frame::{FrameCore, StepContext};
@@ -18,6 +17,7 @@ use crate::state::region_frame::RegionFrame;
 use crate::state::slab_frame::SlabFrame;
 use crate::state::task_queue::Task;
 use crate::state::workers::{Roster, Worker};
+use crate::{FrameJob, Micros};
 use slabcast_common::brick::BrickGrid;
 use slabcast_common::ids::{BrickId, WorkerId};
 use slabcast_common::message::{Lease, RegionLease, ToWorker};
@@ -54,7 +54,7 @@ impl LendAhead {
     /// when half is rendered.
     pub(crate) fn is_enough(self, worker: &Worker, lent_us: f64, queue_ahead: u64) -> bool {
         let threads = u64::from(worker.threads);
-        worker.leases >= threads.saturating_mul(queue_ahead.max(2))
+        worker.own_leases() >= threads.saturating_mul(queue_ahead.max(2))
             && lent_us >= 0.5 * self.us * threads as f64
     }
 }
@@ -117,8 +117,9 @@ impl FrameCore {
         if worker.scenes.insert(scene.id) {
             cluster.send(id, ToWorker::Scene(scene.clone()));
         }
-        let (frame, scene, view) = (self.job.frame, scene.id, self.job.view);
-        cluster.send(id, ToWorker::Frame { frame, scene, view, finish: self.finish, plain });
+        let FrameJob { frame, view, share, .. } = *self.job;
+        let (scene, finish) = (scene.id, self.finish);
+        cluster.send(id, ToWorker::Frame { frame, scene, view, finish, plain, share });
     }
 
     /// Calls `send` for each new lease, in order, with the index of the lease among the worker's.
@@ -384,7 +385,7 @@ impl RegionFrame {
                     if waiting == 0 {
                         break;
                     }
-                    let load = cluster.roster.get(id).map_or(u64::MAX, |w| w.leases);
+                    let load = cluster.roster.get(id).map_or(u64::MAX, Worker::own_leases);
                     let at_end = sole_end && is_long && waiting <= 2 * all_threads;
                     let ahead_us = if at_end { end_us } else { ahead.us };
                     let is_short = us < ahead_us * threads as f64
@@ -428,7 +429,7 @@ impl RegionFrame {
     ) -> (Vec<(WorkerId, u64)>, Vec<WorkerId>) {
         let queue = &self.core.table.queue;
         let has_room = |id: WorkerId, w: &Worker| {
-            w.leases < u64::from(w.threads).saturating_mul(leases_a_thread)
+            w.own_leases() < u64::from(w.threads).saturating_mul(leases_a_thread)
                 && cluster.saturated.binary_search(&id).is_err()
         };
         let has_own = |id: WorkerId| queue.any_waiting(self.tiles.owned(id));

@@ -234,12 +234,12 @@ mod tests {
             }
             let mut last = [None; 64];
             for round in 0..3 {
-                r.open(KEY, &bricks, true);
+                r.open(KEY, &bricks, true, &std::collections::BTreeSet::new());
                 let drawn: Vec<u32> = drawn.iter().filter(|d| d.1 == round).map(|d| d.0).collect();
                 r.mark_used(KEY, &drawn, &mut Vec::new());
                 drawn.iter().for_each(|&place| last[place as usize] = Some(round));
             }
-            r.open(KEY, &bricks, true);
+            r.open(KEY, &bricks, true, &std::collections::BTreeSet::new());
             let outline = |place: u32| view.project_rect(&bricks[place as usize].tight);
             let rects: Vec<Rect> = (0..64).filter_map(outline).collect();
             let cut = cut_through(SIZE, &rects, (0, 0), Some(edge));

@@ -302,7 +302,7 @@ impl FrameCore {
 
 impl Frame {
     /// Begins a frame. `lane`: the lane of workers that renders it, if not all do. `sole`: no other
-    /// frame is in flight or queued.
+    /// frame is in flight or queued. Its brick set is open.
     pub(crate) fn start(
         job: Box<FrameJob>,
         lane: Option<u32>,
@@ -312,7 +312,6 @@ impl Frame {
     ) -> Self {
         let began = clock.now();
         let by_region = uses_regions(&job);
-        cluster.residency.open(job.scene.bricks, &job.bricks, by_region);
         let core = FrameCore::new(job, sole, cluster, began);
         let mut frame = match by_region {
             true => Frame::Region(Box::new(RegionFrame::new(core, lane))),
@@ -320,6 +319,11 @@ impl Frame {
         };
         frame.core_mut().ledger.cull_us += clock.now().saturating_sub(began);
         frame
+    }
+
+    /// Whose frame it is.
+    pub(crate) fn share(&self) -> u64 {
+        self.core().job.share
     }
 
     pub(crate) fn core(&self) -> &FrameCore {

@@ -79,6 +79,9 @@ pub(crate) struct Worker {
     pub(crate) scenes: BTreeSet<SceneId>,
     /// Leases of frames in flight that it has not answered.
     pub(crate) leases: u64,
+    /// Those of them that other clients' frames have, as [`crate::Scheduler`] looks at it for the
+    /// frames of one client.
+    pub(crate) others_leases: u64,
     /// Ended frames that it is told about with the next message.
     pub(crate) over: Vec<FrameId>,
     /// Sets whose directories it keeps, the latest last.
@@ -125,6 +128,11 @@ impl Worker {
     /// Whether the worker is active: it takes leases.
     pub(crate) fn is_active(&self) -> bool {
         !self.leaving && !self.is_spare && !self.is_unresponsive && self.paused_until.is_none()
+    }
+
+    /// Leases of the frames of the client that is looked at.
+    pub(crate) fn own_leases(&self) -> u64 {
+        self.leases.saturating_sub(self.others_leases)
     }
 
     /// Since when it owes a sign of life, while it has leases.
@@ -233,6 +241,7 @@ impl Roster {
             paused_until: None,
             scenes: BTreeSet::new(),
             leases: 0,
+            others_leases: 0,
             over: Vec::new(),
             directories: VecDeque::new(),
             heard: now,
@@ -396,6 +405,10 @@ impl Roster {
 
     pub(crate) fn iter(&self) -> impl Iterator<Item = (WorkerId, &Worker)> {
         self.workers.iter()
+    }
+
+    pub(crate) fn iter_mut(&mut self) -> impl Iterator<Item = (WorkerId, &mut Worker)> {
+        self.workers.iter_mut()
     }
 
     /// Returns the active workers, by id.

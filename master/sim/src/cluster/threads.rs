@@ -13,6 +13,9 @@ use slabcast_common::region::{PART_EDGE, parts};
 use slabcast_schedule::Event;
 use std::collections::BTreeSet;
 
+/// Time that a thread draws a region while another client waits, as in the worker's queue.
+const SLICE: Nanos = 20_000_000;
+
 impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
     /// A worker has decoded a lease.
     pub(super) fn take_lease(&mut self, id: WorkerId, lent: Lent) {
@@ -45,6 +48,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             task,
             facts,
             set: job.scene.bricks,
+            share: job.share,
             received: self.now_ns(),
             order: self.order,
             prefetched: false,
@@ -58,10 +62,36 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             drawn_ns: 0,
             pixels: 0,
         };
-        self.workers.get_mut(&id).expect("it is there").loans.push(loan);
+        let share = job.share;
+        let w = self.workers.get_mut(&id).expect("it is there");
+        w.loans.push(loan);
+        let least = w.spent.values().copied().min().unwrap_or(0);
+        w.spent.entry(share).or_insert(least);
+        for thread in 0..w.running.len() {
+            self.cut_run(id, thread, share);
+        }
     }
 
-    /// Takes the task that a thread draws next: of the oldest frame, tasks that go on before tasks
+    /// Lets a run give way to a client that waits, at the end of its slice.
+    fn cut_run(&mut self, id: WorkerId, thread: usize, share: u64) {
+        let now = self.now_ns();
+        self.order += 1;
+        let version = self.order;
+        let w = self.workers.get_mut(&id).expect("it is there");
+        let Some(run) = &mut w.running[thread] else { return };
+        let is_region = matches!(run.loan.task, Task::Region(..));
+        if run.loan.share == share || !is_region || run.gives_way.is_some() {
+            return;
+        }
+        let until = now.max(run.followed + SLICE);
+        if run.end.is_some_and(|end| end > until) {
+            (run.gives_way, run.end, run.version) = (Some(until), Some(until), version);
+            self.later(until, Occurrence::RunEnd { worker: id, thread, version });
+        }
+    }
+
+    /// Takes the task that a thread draws next: of the client that had least
+    /// time and of its oldest frame, tasks that go on before tasks
     /// that begin. A region that lacks bricks at its first sheet stalls at once, and the next one
     /// is tried.
     fn take_task(&mut self, id: WorkerId) -> Option<Loan<M::Region>> {
@@ -81,7 +111,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             let ready = (0..w.loans.len()).filter(|&i| is_ready(&w.loans[i]));
             let next = ready.min_by_key(|&i| {
                 let l = &w.loans[i];
-                (l.task.frame(), !l.begun && l.stalls == 0, l.order)
+                (w.spent.get(&l.share), l.task.frame(), !l.begun && l.stalls == 0, l.order)
             })?;
             let mut loan = w.loans.remove(next);
             let (set, frame) = (loan.set, loan.task.frame());
@@ -170,7 +200,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             loan.pixels = machine.run(now, ns);
         }
         self.order += 1;
-        let version = self.order;
+        let (version, share) = (self.order, loan.share);
         let (is_deadly, hangs) = (faults.deadly_tile == corner, faults.hanging_tile == corner);
         w.running[thread] = Some(Run {
             loan,
@@ -180,6 +210,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             stretch,
             followed: start,
             stolen_ns: 0,
+            gives_way: None,
             end: (!is_deadly && !hangs).then_some(end),
             version,
         });
@@ -188,6 +219,9 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             self.later(now + (end - now) / 2, kill);
         } else if !hangs {
             self.later(end, Occurrence::RunEnd { worker: id, thread, version });
+        }
+        if let Some(other) = self.workers[&id].loans.iter().map(|l| l.share).find(|s| *s != share) {
+            self.cut_run(id, thread, other);
         }
     }
 
@@ -200,6 +234,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         let (Task::Region(_, region), Some(old)) = (&mut run.loan.task, run.end) else { return };
         let runs_ns = region.runs_ns(&has(&w.present[&run.loan.set]));
         let end = run.followed + (runs_ns * run.stretch).round() as Nanos;
+        let end = run.gives_way.map_or(end, |until| end.min(until));
         if end != old {
             (run.end, run.version) = (Some(end), version);
             self.later(end, Occurrence::RunEnd { worker: id, thread, version });
@@ -233,7 +268,12 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
     fn stop(&mut self, id: WorkerId, thread: usize) -> Option<Loan<M::Region>> {
         let now = self.now_ns();
         let w = self.workers.get_mut(&id).expect("it is there");
-        let run = w.running[thread].take().expect("a run that ends has begun");
+        let mut run = w.running[thread].take().expect("a run that ends has begun");
+        *w.spent.entry(run.loan.share).or_default() += now - run.start;
+        let gives_way = run.gives_way.is_some_and(|until| until <= now);
+        if gives_way {
+            run.follow(&w.present[&run.loan.set], now);
+        }
         w.idle[thread] = Idle { since: now, heard: None };
         let tables = run.start + run.tables_ns;
         let blocks = tables + run.blocks_ns;
@@ -247,7 +287,14 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         self.outcome_of(frame).render += drawn - run.start;
         let w = self.workers.get_mut(&id).expect("it is there");
         if let Task::Region(lease, region) = &mut loan.task {
-            region.advance(f64::INFINITY, &has(&w.present[&loan.set]));
+            if !gives_way {
+                region.advance(f64::INFINITY, &has(&w.present[&loan.set]));
+            } else if !region.is_done() {
+                if w.frames.contains(&frame) {
+                    w.loans.push(loan);
+                }
+                return None;
+            }
             if !region.is_done() {
                 if w.frames.contains(&frame) && !w.leaving {
                     self.stall(id, loan, true);

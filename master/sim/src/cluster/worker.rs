@@ -53,6 +53,8 @@ pub(super) struct Loan<R> {
     pub(super) task: Task<R>,
     pub(super) facts: TaskFacts,
     pub(super) set: BrickSetKey,
+    /// Whose frame it is of.
+    pub(super) share: u64,
     pub(super) received: Nanos,
     /// The order in which threads take tasks.
     pub(super) order: u64,
@@ -89,6 +91,8 @@ pub(super) struct Run<R> {
     pub(super) followed: Nanos,
     /// Time that messages took of its core.
     pub(super) stolen_ns: Nanos,
+    /// When it gives way to another client, if one waits.
+    pub(super) gives_way: Option<Nanos>,
     /// When it ends, not counting messages meanwhile; `None`: never by itself.
     pub(super) end: Option<Nanos>,
     /// The version of the end that counts.
@@ -159,6 +163,8 @@ pub(super) struct Worker<R> {
     /// Frames that were announced and have not ended.
     pub(super) frames: BTreeSet<FrameId>,
     pub(super) loans: Vec<Loan<R>>,
+    /// Time that each client had of its threads.
+    pub(super) spent: BTreeMap<u64, Nanos>,
     pub(super) running: Vec<Option<Run<R>>>,
     pub(super) idle: Vec<Idle>,
     /// When its tables of a frame are made.
@@ -205,6 +211,7 @@ impl<R> Worker<R> {
             first: BTreeMap::new(),
             frames: BTreeSet::new(),
             loans: Vec::new(),
+            spent: BTreeMap::new(),
             running: (0..threads).map(|_| None).collect(),
             idle: vec![Idle::default(); threads],
             tables: BTreeMap::new(),

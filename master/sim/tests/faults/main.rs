@@ -3,6 +3,7 @@
 //!
 //! Campaigns draw whole clusters and their incidents from seeds; [`stories`] change one thing each.
 
+mod clients;
 mod lies;
 mod pattern;
 mod silent;
@@ -68,6 +69,11 @@ const MIXED: Schedules = &[Schedule::Slab, Schedule::Auto];
 
 /// Runs the world of a seed to its end.
 fn chaos(seed: u64, schedules: Schedules) -> World {
+    chaos_of(seed, schedules, 1)
+}
+
+/// Runs the world of a seed to its end, with frames of so many clients in turn.
+fn chaos_of(seed: u64, schedules: Schedules, clients: u64) -> World {
     let mut rng = Rng::new(seed ^ 0xc4a0_5000);
     let config = Config {
         lease: rng.pick(&[60_000_000, 60_000_000, 100_000, 20_000]),
@@ -86,7 +92,7 @@ fn chaos(seed: u64, schedules: Schedules) -> World {
             (pattern::key(n), pattern::bricks(&mut rng, dims, fill))
         })
         .collect();
-    let frames = rng.between(1, 3);
+    let frames = clients * rng.between(1, 3);
     for frame in 0..frames {
         let (set, bricks) = &sets[rng.below(sets.len() as u64) as usize];
         let quality = Quality {
@@ -105,7 +111,8 @@ fn chaos(seed: u64, schedules: Schedules) -> World {
             ..Work::default()
         };
         let size = [rng.between(1, 130) as u32, rng.between(1, 130) as u32];
-        let job = pattern::job(&mut rng, frame, &scene, bricks, size, work);
+        let mut job = pattern::job(&mut rng, frame, &scene, bricks, size, work);
+        job.share = frame % clients;
         let when = rng.below(30_000);
         // In the order of their numbers.
         w.schedule(1_000 + 50_000 * frame + when, Incident::Queue(job));
@@ -153,6 +160,16 @@ fn chaos_under_the_region_schedule_leaves_serial_pictures() {
 #[test]
 fn chaos_under_mixed_schedules_leaves_serial_pictures() {
     campaign(MIXED, seeds(100));
+}
+
+#[test]
+fn chaos_of_several_clients_leaves_serial_pictures() {
+    for schedules in [REGION, MIXED] {
+        for seed in seeds(60) {
+            let logs = [(); 2].map(|()| chaos_of(seed, schedules, 3).observer.audit.log);
+            assert_eq!(logs[0], logs[1], "seed {seed} replays");
+        }
+    }
 }
 
 /// A world whose frames come one by one, of one set and one size. Each is the only one in flight,

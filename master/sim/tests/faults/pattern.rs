@@ -91,7 +91,16 @@ pub(crate) fn job(
     let finish = [None, Some(PixelFormat::Rgb8), None, Some(PixelFormat::Rgba32F)]
         [(frame % 4) as usize]
         .map(|format| PixelEncoding { format, background: Background::Colour([0.1, 0.7, 0.4]) });
-    Box::new(FrameJob { frame: FrameId(frame), number: frame, scene, bricks, view, work, finish })
+    Box::new(FrameJob {
+        frame: FrameId(frame),
+        number: frame,
+        scene,
+        bricks,
+        view,
+        work,
+        finish,
+        share: 0,
+    })
 }
 
 /// Returns the rectangle and sheets of each brick of a job.

@@ -25,7 +25,7 @@
 
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, WorkerId};
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
 mod books;
@@ -157,8 +157,15 @@ impl Residency {
     }
 
     /// Makes `key` the current set. With `on_request`, workers ask for its bricks, and a set that
-    /// is already open stays as it is, since overlapping frames share it.
-    pub(crate) fn open(&mut self, key: BrickSetKey, bricks: &Arc<[BrickInfo]>, on_request: bool) {
+    /// is already open stays as it is, since overlapping frames share it. Sets of frames `in_flight`
+    /// stay open, although no worker may hold a brick of them yet.
+    pub(crate) fn open(
+        &mut self,
+        key: BrickSetKey,
+        bricks: &Arc<[BrickInfo]>,
+        on_request: bool,
+        in_flight: &BTreeSet<BrickSetKey>,
+    ) {
         if on_request {
             self.round += 1;
             if self.on_request && self.current == key && self.sets.contains_key(&key) {
@@ -172,11 +179,16 @@ impl Residency {
             let dropping = &holder.dropping;
             holder.sets.retain(|k, b| {
                 let empty = b.held_count == 0 && b.in_flight.is_empty();
-                *k == key || !empty || dropping.iter().any(|(_, set, _)| set == k)
+                *k == key
+                    || in_flight.contains(k)
+                    || !empty
+                    || dropping.iter().any(|(_, set, _)| set == k)
             });
         }
         let workers = &self.workers;
-        self.sets.retain(|k, _| *k == key || workers.values().any(|s| s.sets.contains_key(k)));
+        self.sets.retain(|k, _| {
+            *k == key || in_flight.contains(k) || workers.values().any(|s| s.sets.contains_key(k))
+        });
         self.current = key;
         self.round_bytes = 0;
         let set = self.sets.entry(key).or_insert_with(|| Set::new(bricks));

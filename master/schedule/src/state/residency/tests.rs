@@ -13,7 +13,7 @@ fn residency(budget: u64) -> Residency {
         (0..10).map(|i| BrickInfo { id: BrickId(2 * i), tight, voxels: 9, bytes: 100 }).collect();
     let mut r = Residency::default();
     r.join(W, budget, vec![(KEY, vec![BrickId(0), BrickId(0), BrickId(3)])]);
-    r.open(KEY, &bricks, false);
+    r.open(KEY, &bricks, false, &BTreeSet::new());
     r
 }
 
@@ -43,7 +43,7 @@ fn residency_reports_bricks_not_used_lately_as_newly_used() {
     let bricks = r.sets[&KEY].bricks.clone();
     let newly_used = |r: &mut Residency, indices: &[u32]| {
         let mut newly_used = Vec::new();
-        r.open(KEY, &bricks, true);
+        r.open(KEY, &bricks, true, &BTreeSet::new());
         r.mark_used(KEY, indices, &mut newly_used);
         newly_used
     };
@@ -61,7 +61,7 @@ fn residency_reports_bricks_not_used_lately_as_newly_used() {
 fn prefetch_sends_bricks_only_where_all_of_them_fit() {
     let mut r = residency(300);
     let bricks = r.sets[&KEY].bricks.clone();
-    r.open(KEY, &bricks, true);
+    r.open(KEY, &bricks, true, &BTreeSet::new());
     let other = WorkerId(2);
     r.join(other, 1000, Vec::new());
     let list = |indices: &[u32]| vec![(W, indices.to_vec()), (other, indices.to_vec())];

@@ -97,6 +97,8 @@ struct Flight {
     share: u64,
     /// Whether it takes memory of the reserve for addresses that have no other frame in flight.
     in_reserve: bool,
+    /// Whether it is drawn under the `slab` schedule.
+    is_slab: bool,
     /// Bytes that it takes while it is made, and when it is finished.
     making_bytes: u64,
     finished_bytes: u64,

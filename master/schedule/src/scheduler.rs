@@ -144,6 +144,8 @@ impl Scheduler {
             }
             Event::Result { worker, result } => {
                 cluster.roster.heard(worker, now);
+                // A vote that counted when its time was over may have left some, of another set.
+                cluster.newly_used.clear();
                 let from = cluster.roster.get(worker);
                 // Results of local workers cross no link.
                 if from.is_some_and(|w| !w.is_local) {

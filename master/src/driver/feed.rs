@@ -24,6 +24,7 @@ use crate::panics::{Panicked, caught};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, JobId};
 use slabcast_common::link::{FRAMES_IN_FLIGHT, MOST_FRAMES_IN_FLIGHT};
+use slabcast_common::quality::Schedule;
 use slabcast_schedule::{Clock, Event as Happened, FrameJob, Micros};
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
@@ -95,6 +96,7 @@ impl Driver {
     /// Gives the scheduler frames while there is room for them.
     pub(super) fn feed(&mut self) {
         self.look_again_at = None;
+        self.make_way();
         while self.flights.len() < MOST_FRAMES_IN_FLIGHT {
             let Some((candidate, in_reserve)) = self.pick() else { break };
             if !self.begin(candidate, in_reserve) {
@@ -150,6 +152,27 @@ impl Driver {
         let share = self.active.share(candidate.job);
         let is_only = self.flights.values().all(|f| f.share != share);
         room.places(&self.shares, (candidate.wanted, is_only), making, finished)
+    }
+
+    /// Whether a job of another address is in progress.
+    fn others_are_open(&self, share: u64) -> bool {
+        let table = self.jobs.lock();
+        let is_open = |id: &JobId| table.get(*id).is_some_and(|job| !job.view.state.is_over());
+        self.active.ids().any(|id| self.active.share(id) != share && is_open(&id))
+    }
+
+    /// Takes back a frame of the `slab` schedule, beside which no other can be drawn, when another
+    /// address has a job. It is drawn again under `region` ([`Driver::begin`]), to the same pixels.
+    fn make_way(&mut self) {
+        let is_in_the_way = |f: &Flight| f.is_slab && self.others_are_open(f.share);
+        let flights = self.flights.iter().filter(|(_, f)| is_in_the_way(f));
+        let frames: Vec<FrameId> = flights.map(|(frame, _)| *frame).collect();
+        for frame in frames {
+            let Some(Flight { job, number, .. }) = self.land(frame) else { continue };
+            info!(%job, frame = number, "drawn by regions, since others have jobs");
+            self.scheduler.handle(&self.clock, Happened::CancelFrame { frame });
+            self.jobs.lock().draw_again(job, number);
+        }
     }
 
     /// Whether a frame may begin beside those in flight: there are fewer than [`FRAMES_IN_FLIGHT`] and
@@ -233,7 +256,9 @@ impl Driver {
         self.jobs.lock().evict(kept as usize, None);
         self.last_frame_id += 1;
         let share = self.active.share(id);
+        let others_are_open = self.others_are_open(share);
         let Some(job) = self.active.get(id) else { return false };
+        let is_slab = job.request.work.schedule == Schedule::Slab && !others_are_open;
         let frame = FrameId(self.last_frame_id);
         let frame_span = tracing::info_span!("frame", job = %id, number, id = %frame);
         let scene = job.scene_of(number, frame);
@@ -246,6 +271,7 @@ impl Driver {
             wanted,
             share,
             in_reserve,
+            is_slab,
             making_bytes,
             finished_bytes,
             took_us: None,
@@ -255,13 +281,17 @@ impl Driver {
         };
         self.flights.insert(frame, flight);
         let own_scene = job.tween.is_some().then_some(scene.id);
+        let mut work = job.request.work;
+        if work.schedule == Schedule::Slab && !is_slab {
+            work.schedule = Schedule::Region;
+        }
         let queued = FrameJob {
             frame,
             number,
             scene,
             bricks: store.infos().clone(),
             view,
-            work: job.request.work,
+            work,
             finish: (!job.request.want_hash).then(|| job.request.encoding()),
             share,
         };

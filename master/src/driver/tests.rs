@@ -9,7 +9,7 @@ use crate::panics::caught;
 use slabcast_common::image::{Background, PixelFormat, SparseTile, TilePixels};
 use slabcast_common::message::{Counters, Pixels, RegionCost, TaskTimes, TileResult};
 use slabcast_common::occlusion::Rect;
-use slabcast_common::quality::{Quality, Work};
+use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
 use slabcast_scene::path::{Orientation, Turntable, ViewPath};
@@ -580,6 +580,33 @@ async fn frames_of_an_address_that_never_end_keep_no_other_address_waiting() {
     for job in jobs {
         assert!(handle.cancel(job).await);
     }
+    master.shutdown().await;
+}
+
+/// Nothing can be drawn beside a frame of the `slab` schedule, and this one never ends: the worker
+/// draws regions alone.
+#[tokio::test]
+async fn frame_of_the_slab_schedule_makes_way_for_another_address_and_is_drawn_by_regions() {
+    let master = master(Hooks::default(), 100_000);
+    let handle = master.handle();
+    join(&handle, Arc::default());
+    let slab = PathRequest {
+        work: Work { schedule: Schedule::Slab, ..Work::default() },
+        ..request("slab", 3, "grey")
+    };
+    let first = handle.submit_from(slab, Some([10, 0, 0, 1].into())).await.expect("good");
+    while handle.job(first).expect("it is there").state != JobState::Running {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    let other = Some([10, 0, 0, 2].into());
+    let job = handle.submit_from(request("x", 100_000, "fog"), other).await.expect("good");
+    let watching = handle.clone();
+    tokio::spawn(async move { watched(&watching, job).await });
+    // The first has its turn while the other is in progress.
+    let ends = tokio::time::timeout(Duration::from_secs(20), watched(&handle, first)).await;
+    assert_eq!(ends.expect("in time"), (JobState::Done, 3));
+    assert!(handle.job(job).expect("it is there").frames_done > 0);
+    assert!(handle.cancel(job).await);
     master.shutdown().await;
 }
 

@@ -89,16 +89,8 @@ pub(crate) fn jobs(scenes: &PathScenes, frames: usize, work: Work) -> Result<Vec
             let view = scenes.view(i, &scene.quality)?;
             let (frame, number) = (FrameId(i as u64 + 1), i as u64);
             let (scene, bricks) = (scene.clone(), bricks.clone());
-            Ok(FrameJob {
-                frame,
-                number,
-                scene,
-                bricks,
-                view,
-                work,
-                finish: Some(FINISH),
-                share: 0,
-            })
+            let (finish, share) = (Some(FINISH), 0);
+            Ok(FrameJob { frame, number, scene, bricks, view, work, finish, share })
         })
         .collect()
 }

@@ -271,7 +271,18 @@ async fn watched(seed: u64, flips: u64, one_in: u64) {
             damaged += frames.damaged_messages();
             got
         });
-        assert_eq!(got.await.expect("no watch hangs"), want, "seed {seed}");
+        let Ok(got) = got.await else {
+            let handle = world.master.handle();
+            let flips = noise.each_ref().map(|n| n.flips.load(Relaxed));
+            panic!(
+                "seed {seed}: job {} hangs after {flips:?} flips and {damaged} damaged messages of \
+                 watches: {:?}, {:?}",
+                world.jobs,
+                handle.jobs().last(),
+                handle.workers().await,
+            );
+        };
+        assert_eq!(got, want, "seed {seed}");
     }
     let [up, down] = noise.each_ref().map(|n| n.flips.load(Relaxed));
     println!(

@@ -4,7 +4,7 @@
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::limit::ByteCap;
 use crate::samples::{self, DIM_MAX, Layout, SKIP_MAX_BYTES, Supply};
-use crate::source::{self, Folder, Source};
+use crate::source::{self, Folder, Notes, Source};
 use crate::unpack::{Encoding, wrapped};
 use slabcast_common::volume::{Samples, ValueMap};
 use std::collections::VecDeque;
@@ -91,18 +91,18 @@ pub(crate) fn read(
 }
 
 /// Reads the samples from files in the header's folder or below it; each holds an equal share.
-/// `field` is the header's name for them, `cap` the limit of all together.
+/// `field` is the header's name for them, `cap` the limit of all together, `notes` the header's.
 pub(crate) fn read_files(
     folder: &Path,
     (names, field): (&[String], &str),
-    cap: ByteCap,
+    (cap, notes): (ByteCap, &Notes),
     storage: &Storage,
     layout: &Layout,
 ) -> Result<(Samples, ValueMap), Problem> {
     let in_file = |name: &str| format!("{field} {}", quoted(name));
     let folder = Folder::open(folder, field)?;
     if let [name] = names {
-        let source = Source { cap, ..folder.named(name, field)? };
+        let source = Source { cap, notes: notes.clone(), ..folder.named(name, field)? };
         let len = source.len;
         return read(source, len, storage, layout).map_err(|mut p| {
             p.field = in_file(name);
@@ -146,7 +146,8 @@ pub(crate) fn read_files(
         parts.push_back(Part { shown: in_file(name), name });
     }
     let supply = total.expect("there is a file");
-    let mut files = FileChain { folder: &folder, parts, storage, layout, share, current: None };
+    let mut files =
+        FileChain { folder: &folder, parts, storage, layout, share, notes, current: None };
     samples::read(&mut files, supply, &storage.decoded_layout(layout), cap).map_err(|mut p| {
         if p.field == "data" {
             p.field = field.into();
@@ -206,8 +207,10 @@ fn open<'a>(
             "save it again without a skip",
         ));
     }
-    let (mut reader, supply) =
-        storage.encoding.open(Box::new(source.reader), left, layout.number).map_err(io)?;
+    let (mut reader, supply) = storage
+        .encoding
+        .open(Box::new(source.reader), left, layout.number, &source.notes)
+        .map_err(io)?;
     if skip > 0 {
         match source::skip_bytes(&mut *reader, skip) {
             Ok(true) => {}
@@ -243,6 +246,7 @@ struct FileChain<'a> {
     layout: &'a Layout,
     /// Bytes of samples in each file.
     share: u64,
+    notes: &'a Notes,
     /// The current file: its name, its reader, and the bytes still to come.
     current: Option<(String, Box<dyn Read + Send>, u64)>,
 }
@@ -259,6 +263,7 @@ impl Read for FileChain<'_> {
                     wrapped(p)
                 };
                 let source = self.folder.named(file, "data").map_err(name_file)?;
+                let source = Source { notes: self.notes.clone(), ..source };
                 let len = source.len;
                 let (reader, _) =
                     open(source, len, self.storage, self.layout, self.share).map_err(name_file)?;
@@ -274,7 +279,16 @@ impl Read for FileChain<'_> {
             };
             if *left == 0 {
                 let packed = self.storage.encoding != Encoding::Raw;
-                if packed && reader.read(&mut [0])? > 0 {
+                let end = match reader.read(&mut [0]) {
+                    Err(e) if packed && e.kind() == std::io::ErrorKind::UnexpectedEof => {
+                        return Err(damaged(
+                            "ends before the checksum of its stream".into(),
+                            "get the whole file",
+                        ));
+                    }
+                    end => end,
+                };
+                if packed && end? > 0 {
                     return Err(damaged(
                         format!("goes on after its share of {} bytes", self.share),
                         "correct the list or the sizes",

@@ -49,6 +49,7 @@ pub mod framing;
 #[cfg(test)]
 mod fuzz;
 mod limit;
+mod members;
 mod metaimage;
 mod nifti;
 mod nrrd;
@@ -164,8 +165,12 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
     }
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let folder = path.parent().unwrap_or(Path::new("."));
+    let notes = source.notes.clone();
     let error = match read_noted(source, folder, &name, hints) {
-        Ok(opened) => return Ok(opened),
+        Ok(mut opened) => {
+            opened.notes.extend(notes.take());
+            return Ok(opened);
+        }
         Err(e) => e,
     };
     // A data file with a header beside it is opened through the header.
@@ -173,13 +178,15 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
         && let Some(header) = header_beside(path)
     {
         let source = Source { cap: hints.cap(), ..Source::open(&header, "file")? };
+        let notes = source.notes.clone();
         let header_name = header.file_name().unwrap_or_default().to_string_lossy();
         let volume = read(source, folder, &header_name, hints).map_err(|mut p| {
             p.field = format!("its header {}: {}", error::quoted(&header_name), p.field);
             p
         })?;
         let note = format!("{name} is raw data; its header {header_name} beside it was read");
-        return Ok(Opened { volume, notes: vec![note] });
+        let notes = std::iter::once(note).chain(notes.take()).collect();
+        return Ok(Opened { volume, notes });
     }
     Err(error)
 }

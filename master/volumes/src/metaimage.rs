@@ -41,7 +41,7 @@ pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volu
         }
         Some(names) => {
             let names = (&names[..], "ElementDataFile");
-            data::read_files(folder, names, source.cap, &storage, &layout)?
+            data::read_files(folder, names, (source.cap, &source.notes), &storage, &layout)?
         }
     };
     Ok(Volume::new(name, layout.number.name(), anatomical, lattice, samples, map))

@@ -5,9 +5,9 @@
 //! else the qform, else the spacings alone (methods 3, 2 and 1 of nifti1.h), as in nibabel.
 
 use crate::error::{OpenErrorKind, Problem};
+use crate::members::{Members, Packing};
 use crate::samples::{self, Endian, Layout, Number, SKIP_MAX_BYTES, Supply};
 use crate::source::{self, Source};
-use flate2::bufread::MultiGzDecoder;
 use glam::{DMat3, DVec3};
 use slabcast_common::volume::{Lattice, ValueMap, Volume};
 use std::io::Read;
@@ -25,8 +25,10 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 /// Reads a volume from the start of a source.
 pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Problem> {
     let (len, cap) = (source.len, source.cap);
-    let mut reader: Box<dyn Read + Send> =
-        if gzip { Box::new(MultiGzDecoder::new(source.reader)) } else { Box::new(source.reader) };
+    let mut reader: Box<dyn Read + Send> = match gzip {
+        true => Box::new(Members::new(Packing::Gzip, source.reader, source.notes.clone())),
+        false => Box::new(source.reader),
+    };
     let reader = &mut *reader;
     let mut bytes = [0u8; HEADER_2_BYTES];
     fill(reader, &mut bytes[..4])?;
@@ -77,6 +79,10 @@ fn fill(reader: &mut dyn Read, bytes: &mut [u8]) -> Result<(), Problem> {
 }
 
 fn broken(e: &std::io::Error) -> Problem {
+    // Our own readers wrap a problem in the error; pass it on unchanged.
+    if let Some(problem) = e.get_ref().and_then(|inner| inner.downcast_ref::<Problem>()) {
+        return problem.clone();
+    }
     match e.kind() {
         std::io::ErrorKind::UnexpectedEof => Problem::new(
             OpenErrorKind::Damaged,

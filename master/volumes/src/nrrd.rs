@@ -37,7 +37,13 @@ pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volu
         }
         Some(files) => {
             let files = (&files[..], "data file");
-            data::read_files(folder, files, source.cap, &header.storage, &header.layout)
+            data::read_files(
+                folder,
+                files,
+                (source.cap, &source.notes),
+                &header.storage,
+                &header.layout,
+            )
         }
     };
     let (samples, map) = samples?;

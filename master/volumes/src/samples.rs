@@ -437,6 +437,19 @@ impl ByteReader<'_> {
             return problem.clone();
         }
         match (self.supply, e.kind()) {
+            (Supply::Encoded { name, .. }, std::io::ErrorKind::UnexpectedEof)
+                if have == self.need =>
+            {
+                Problem::new(
+                    OpenErrorKind::Damaged,
+                    "data",
+                    format!(
+                        "truncated: all {have} bytes of samples are there, but the {name} stream \
+                         ends before its checksum, so nothing shows that they are right"
+                    ),
+                    "get the whole file, or unpack what is there and pack it again",
+                )
+            }
             (Supply::Encoded { .. }, std::io::ErrorKind::UnexpectedEof) => {
                 truncated(self.need, have)
             }

@@ -9,6 +9,7 @@ use crate::limit::ByteCap;
 use std::fs::File;
 use std::io::{BufRead, BufReader, ErrorKind, Read, Seek};
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
 
 /// Reader under a [`Source`]: a file, or bytes of a test.
 pub(crate) trait Stream: Read + Seek + Send {}
@@ -21,6 +22,27 @@ pub(crate) struct Source {
     pub(crate) len: u64,
     /// Most bytes of samples that it may become.
     pub(crate) cap: ByteCap,
+    /// Choices that the reader makes, for the user.
+    pub(crate) notes: Notes,
+}
+
+/// Notes of a reader, shared by all sources and decoders of one volume.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Notes(Arc<Mutex<Vec<String>>>);
+
+impl Notes {
+    /// Adds a sentence, if it was not said already.
+    pub(crate) fn add(&self, note: impl Into<String>) {
+        let (note, mut notes) = (note.into(), self.0.lock().unwrap_or_else(|e| e.into_inner()));
+        if !notes.contains(&note) {
+            notes.push(note);
+        }
+    }
+
+    /// Returns all notes, and leaves none.
+    pub(crate) fn take(&self) -> Vec<String> {
+        std::mem::take(&mut *self.0.lock().unwrap_or_else(|e| e.into_inner()))
+    }
 }
 
 /// Enough to recognise a format ([`Source::head`]) with few system calls. Samples are read past the
@@ -73,7 +95,7 @@ impl Source {
     /// Returns a source of an open regular file of `len` bytes.
     fn from_file(file: File, len: u64) -> Source {
         let reader = BufReader::with_capacity(BUFFER_BYTES, Box::new(file) as Box<dyn Stream>);
-        Source { reader, len, cap: ByteCap::default() }
+        Source { reader, len, cap: ByteCap::default(), notes: Notes::default() }
     }
 
     /// Returns a source of bytes, for tests.
@@ -84,6 +106,7 @@ impl Source {
             reader: BufReader::with_capacity(BUFFER_BYTES, Box::new(std::io::Cursor::new(bytes))),
             len,
             cap: ByteCap::default(),
+            notes: Notes::default(),
         }
     }
 

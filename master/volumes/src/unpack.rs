@@ -3,9 +3,9 @@
 //! ([`Supply`]).
 
 use crate::error::{OpenErrorKind, Problem, quoted};
+use crate::members::{Members, Packing};
 use crate::samples::{Number, Supply};
-use bzip2::bufread::MultiBzDecoder;
-use flate2::bufread::{MultiGzDecoder, ZlibDecoder};
+use crate::source::Notes;
 use std::io::{BufRead, Read};
 
 /// How samples are encoded.
@@ -30,21 +30,19 @@ impl Encoding {
         mut inner: Box<dyn BufRead + Send + 'a>,
         bytes: u64,
         number: Number,
+        notes: &Notes,
     ) -> std::io::Result<(Box<dyn Read + Send + 'a>, Supply)> {
         let encoded = |name, ratio| Supply::Encoded { name, bytes, ratio };
+        let members = |packing, inner| Box::new(Members::new(packing, inner, notes.clone()));
         Ok(match self {
             Encoding::Raw => (Box::new(inner), Supply::Plain { have: bytes }),
-            Encoding::Gzip => {
-                (Box::new(MultiGzDecoder::new(inner)), Supply::deflate("gzip", bytes))
-            }
+            Encoding::Gzip => (members(Packing::Gzip, inner), Supply::deflate("gzip", bytes)),
             Encoding::Deflate if inner.fill_buf()?.starts_with(&[0x1f, 0x8b]) => {
-                (Box::new(MultiGzDecoder::new(inner)), Supply::deflate("gzip", bytes))
+                (members(Packing::Gzip, inner), Supply::deflate("gzip", bytes))
             }
-            Encoding::Deflate => {
-                (Box::new(ZlibDecoder::new(inner)), Supply::deflate("zlib", bytes))
-            }
+            Encoding::Deflate => (members(Packing::Zlib, inner), Supply::deflate("zlib", bytes)),
             // Runs of 259 bytes become five, and a block of 900,000 of those compresses to 40.
-            Encoding::Bzip2 => (Box::new(MultiBzDecoder::new(inner)), encoded("bzip2", 1 << 21)),
+            Encoding::Bzip2 => (members(Packing::Bzip2, inner), encoded("bzip2", 1 << 21)),
             // A number takes at least a digit and a space; the last space may be missing.
             Encoding::Ascii => (
                 Box::new(Text { inner, number, word: Vec::new(), out: [0; 8], next: 8, seen: 0 }),

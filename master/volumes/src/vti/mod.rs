@@ -15,7 +15,7 @@ mod tags;
 use crate::error::{Problem, quoted};
 use crate::limit::ByteCap;
 use crate::samples::{self, Endian, Layout, Number, Supply};
-use crate::source::{Source, Stream};
+use crate::source::{Notes, Source, Stream};
 use crate::unpack::{Base64, Encoding};
 use blocks::Blocks;
 use glam::{DMat3, DVec3};
@@ -300,8 +300,9 @@ fn read_array(
 ) -> Result<(Samples, ValueMap), Problem> {
     if format == DataFormat::Text {
         let text = Box::new(blocks::UntilTag { inner: reader });
-        let (mut reader, supply) =
-            Encoding::Ascii.open(text, left, layout.number).map_err(|e| Problem::io("data", &e))?;
+        let (mut reader, supply) = Encoding::Ascii
+            .open(text, left, layout.number, &Notes::default())
+            .map_err(|e| Problem::io("data", &e))?;
         return samples::read(
             &mut *reader,
             supply,

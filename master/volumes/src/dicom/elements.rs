@@ -57,8 +57,13 @@ const UNDEFINED: u32 = u32::MAX;
 /// How pixels are stored.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Pixels {
-    /// Uncompressed, with their number of bytes.
-    Native(u64),
+    /// Uncompressed.
+    Native {
+        /// Bytes of the element.
+        bytes: u64,
+        /// Whether they are words of 16 bits (VR OW), whose bytes the byte order turns.
+        words: bool,
+    },
     /// Run-length encoded, in fragments.
     Rle,
 }
@@ -150,7 +155,7 @@ impl File {
             reader.inner = Box::new(std::io::BufReader::new(DeflateDecoder::new(inner)));
             len = len.saturating_mul(1032);
         }
-        let bytes = loop {
+        let (bytes, words) = loop {
             if reader.inner.fill_buf().map_err(|e| broken(&e))?.is_empty() {
                 return Err(Problem::new(
                     OpenErrorKind::NotAVolume,
@@ -159,8 +164,8 @@ impl File {
                     "leave the file out",
                 ));
             }
-            if let Some(bytes) = reader.element(syntax, &mut values, len)? {
-                break bytes;
+            if let Some(pixels) = reader.element(syntax, &mut values, len)? {
+                break pixels;
             }
         };
         let pixels = match (rle, bytes) {
@@ -170,7 +175,7 @@ impl File {
                 if u64::from(n) > left {
                     return Err(crate::samples::truncated(n.into(), left));
                 }
-                Pixels::Native(n.into())
+                Pixels::Native { bytes: n.into(), words }
             }
             _ => {
                 return Err(Problem::malformed(
@@ -290,7 +295,7 @@ impl ElementReader {
         })
     }
 
-    /// Reads tag and length of the next element, and whether it is a sequence.
+    /// Reads tag and length of the next element, and whether it has the type OW.
     fn head(&mut self, s: Syntax) -> Result<(Tag, u32, bool), Problem> {
         self.elements += 1;
         if self.elements > ELEMENTS_MAX {
@@ -325,20 +330,20 @@ impl ElementReader {
             }
             false => self.short(s.endian)?.into(),
         };
-        Ok((tag, len, &kind == b"SQ"))
+        Ok((tag, len, &kind == b"OW"))
     }
 
-    /// Reads an element, and keeps or skips its value. Returns the length of the pixels if they
-    /// come next. `len` is the most bytes that the file can have.
+    /// Reads an element, and keeps or skips its value. Returns the length of the pixels, and
+    /// whether they are 16-bit words, if they come next. `len` is the most bytes that the file can have.
     fn element(
         &mut self,
         s: Syntax,
         values: &mut BTreeMap<Tag, Vec<u8>>,
         len: u64,
-    ) -> Result<Option<u32>, Problem> {
-        let (tag, bytes, _) = self.head(s)?;
+    ) -> Result<Option<(u32, bool)>, Problem> {
+        let (tag, bytes, words) = self.head(s)?;
         if tag == (0x7fe0, 0x0010) {
-            return Ok(Some(bytes));
+            return Ok(Some((bytes, words)));
         }
         if bytes == UNDEFINED {
             self.skip_undefined(s, 1)?;

@@ -25,9 +25,14 @@ struct Slice {
     spacing: [f64; 3],
     /// InstanceNumber, the order of slices without a position.
     instance: f64,
+    /// Whether the file gives no distance of slices, or one in words.
+    thickness_note: Option<String>,
+    /// Bytes of uncompressed pixels; `None` where they are packed.
+    native_bytes: Option<u64>,
 }
 
-/// Size and number format of a picture, the same for all slices of a series.
+/// Size and number format of a picture. All slices of a series have one size; each may have a
+/// format of its own.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct PixelFormat {
     columns: u16,
@@ -58,8 +63,35 @@ impl Series {
     }
 
     fn is_called(&self, name: &str) -> bool {
-        [&self.uid, &self.number, &self.description, &self.name()].iter().any(|n| *n == name)
+        let whole = self.name();
+        let called = [&self.uid, &self.number, &self.description, &whole];
+        // A long name is shown cut, and may be given as it is shown.
+        called.iter().any(|n| *n == name) || quoted(&whole) == format!("`{name}`")
     }
+}
+
+/// Longest UID of the standard; what is longer is shown cut.
+const UID_MAX_CHARS: usize = 64;
+
+/// Returns what `--series` takes for each series and for no other: `None` where its name does, else
+/// its UID, with `/1`, `/2` and so on where several share that too.
+fn handles(all: &[Series]) -> Vec<Option<String>> {
+    let uid = |s: &Series| match s.uid.is_empty() {
+        true => s.name(),
+        false => s.uid.chars().filter(|c| !c.is_control()).take(UID_MAX_CHARS).collect::<String>(),
+    };
+    let handle = |(i, s): (usize, &Series)| {
+        if all.iter().filter(|t| quoted(&t.name()) == quoted(&s.name())).count() < 2 {
+            return None;
+        }
+        let uid_of = uid(s);
+        let same = |t: &&Series| uid(t) == uid_of;
+        Some(match all.iter().filter(same).count() {
+            0 | 1 => uid_of,
+            _ => format!("{uid_of}/{}", all[..=i].iter().filter(same).count()),
+        })
+    };
+    all.iter().enumerate().map(handle).collect()
 }
 
 /// The series to read.
@@ -97,7 +129,7 @@ pub(super) fn write(
     let preface = arrange(&mut series, &mut notes)?;
     preface.write(out).map_err(|e| Problem::io("pipe", &e))?;
     for slice in &series.slices {
-        let bytes = pixels(slice, preface.float).map_err(|p| in_file(&slice.path, p))?;
+        let bytes = pixels(slice, preface.number).map_err(|p| in_file(&slice.path, p))?;
         out.write_all(&bytes).map_err(|e| Problem::io("pipe", &e))?;
     }
     out.flush().map_err(|e| Problem::io("pipe", &e))
@@ -164,17 +196,18 @@ fn gather(files: &[PathBuf]) -> Result<(Vec<Series>, usize, Vec<Problem>), Probl
 fn choose(mut all: Vec<Series>, choice: &SeriesChoice<'_>) -> Result<Series, Problem> {
     // By size, so that the error lists localizers last.
     all.sort_by_key(|s| std::cmp::Reverse(s.slices.len()));
-    let list = |all: &[Series]| {
-        let name = |s: &Series| {
+    let handles = handles(&all);
+    let list = |which: &[usize]| {
+        let name = |&i: &usize| {
+            let s = &all[i];
             let (name, n) = (s.name(), s.slices.len());
             // Some scanners give all series the same name.
-            let twins = all.iter().filter(|other| other.name() == name).count() > 1;
-            let uid = if twins { format!(", UID {}", quoted(&s.uid)) } else { String::new() };
+            let uid = handles[i].as_ref().map(|uid| format!(", UID `{uid}`")).unwrap_or_default();
             format!("{} ({n} slice{}{uid})", quoted(&name), if n == 1 { "" } else { "s" })
         };
-        let mut names: Vec<String> = all.iter().take(12).map(name).collect();
-        if all.len() > 12 {
-            names.push(format!("and {} more", all.len() - 12));
+        let mut names: Vec<String> = which.iter().take(12).map(name).collect();
+        if which.len() > 12 {
+            names.push(format!("and {} more", which.len() - 12));
         }
         names.join(", ")
     };
@@ -192,26 +225,43 @@ fn choose(mut all: Vec<Series>, choice: &SeriesChoice<'_>) -> Result<Series, Pro
             return Ok(all.swap_remove(found));
         }
     }
+    let every: Vec<usize> = (0..all.len()).collect();
     match choice.series {
         None if all.len() < 2 => Ok(all.swap_remove(0)),
         None => Err(Problem::malformed(
             "--series",
-            format!("the folder holds {} series: {}", all.len(), list(&all)),
+            format!("the folder holds {} series: {}", all.len(), list(&every)),
             "name one of them, its number or its UID",
         )),
         Some(name) => {
-            let called: Vec<usize> = (0..all.len()).filter(|&i| all[i].is_called(name)).collect();
+            let by = |is: &dyn Fn(usize) -> bool| -> Vec<usize> {
+                every.iter().copied().filter(|&i| is(i)).collect()
+            };
+            // Exactly as listed; else a name; else the beginning of a UID, as far as it is unique.
+            let begins = name.trim_end_matches("...").trim_end_matches('\u{2026}');
+            let mut called = by(&|i| handles[i].as_deref() == Some(name));
+            if called.is_empty() {
+                called = by(&|i| all[i].is_called(name));
+            }
+            if called.is_empty() && begins.contains('.') {
+                called = by(&|i| all[i].uid.starts_with(begins));
+            }
             match called[..] {
                 [one] => Ok(all.swap_remove(one)),
                 [] => Err(Problem::malformed(
                     "--series",
-                    format!("there is no {} among {}", quoted(name), list(&all)),
+                    format!("there is no {} among {}", quoted(name), list(&every)),
                     "name one of them, its number or its UID",
                 )),
                 _ => Err(Problem::malformed(
                     "--series",
-                    format!("{} series are called {}: {}", called.len(), quoted(name), list(&all)),
-                    "give the whole name, or the UID",
+                    format!(
+                        "{} series are called {}: {}",
+                        called.len(),
+                        quoted(name),
+                        list(&called)
+                    ),
+                    "give the whole name, or what is listed as UID",
                 )),
             }
         }
@@ -228,7 +278,9 @@ impl Slice {
         let refuse = |field: &str, what: String, remedy: &str| {
             Err(Problem::unsupported(field, what, remedy))
         };
-        if file.text((0x0028, 0x0008)).is_some_and(|n| n != "1") {
+        // `01`, `+1` and an empty count are one frame, and so is 0, which some programs write.
+        let frames = file.text((0x0028, 0x0008));
+        if frames.is_some_and(|n| !matches!(n.parse::<f64>(), Ok(n) if n == 0.0 || n == 1.0)) {
             return refuse(
                 "NumberOfFrames",
                 "is above 1: many pictures in one file are not read".into(),
@@ -270,10 +322,24 @@ impl Slice {
             None => file.numbers::<2>((0x0018, 0x1164))?.unwrap_or([1.0; 2]),
         };
         let positive = |x: f64| if x > 0.0 { x } else { 1.0 };
-        let thick = match file.numbers::<1>((0x0018, 0x0088))? {
-            Some([x]) if x.abs() > 0.0 => Some(x.abs()),
-            _ => file.numbers::<1>((0x0018, 0x0050))?.map(|[x]| x.abs()),
-        };
+        // Where positions give the step these do not matter, so that no wording of them is refused.
+        let mut thickness_note = None;
+        let mut thick = None;
+        for tag in [(0x0018, 0x0088), (0x0018, 0x0050)] {
+            let Some(text) = file.text(tag).filter(|_| thick.is_none()) else { continue };
+            thick = leading_number(&text).map(f64::abs).filter(|x| *x > 0.0);
+            if text.trim().parse::<f64>().is_err() {
+                let (field, text) = (super::elements::name(tag), quoted(&text));
+                thickness_note = Some(match thick {
+                    Some(mm) => format!("{field} is {text}, and {mm} mm was taken"),
+                    None => format!("{field} is {text}, which is no length"),
+                });
+            }
+        }
+        if thick.is_none() {
+            let why = thickness_note.map_or("no distance of slices is given".into(), |n| n);
+            thickness_note = Some(format!("{why}; 1 mm was assumed"));
+        }
         let spacing =
             [positive(between_columns), positive(between_rows), positive(thick.unwrap_or(1.0))];
         let position = file.numbers::<3>((0x0020, 0x0032))?;
@@ -288,8 +354,56 @@ impl Slice {
         let [intercept] = file.numbers::<1>((0x0028, 0x1052))?.unwrap_or([0.0]);
         let rescale = if slope == 0.0 { [1.0, 0.0] } else { [slope, intercept] };
         let instance = file.numbers::<1>((0x0020, 0x0013)).ok().flatten().map_or(0.0, |[n]| n);
-        Ok(Slice { path: path.into(), format, rescale, place, spacing, instance })
+        let native_bytes = match file.pixels {
+            Pixels::Native { bytes, .. } => Some(bytes),
+            Pixels::Rle => None,
+        };
+        Ok(Slice {
+            path: path.into(),
+            format,
+            rescale,
+            place,
+            spacing,
+            instance,
+            thickness_note,
+            native_bytes,
+        })
     }
+
+    /// Returns the bytes that the pixels need.
+    fn need_bytes(&self) -> u64 {
+        let f = self.format;
+        u64::from(f.columns) * u64::from(f.rows) * u64::from(f.allocated / 8)
+    }
+
+    /// Returns how many bytes of padding follow the pixels; an odd number of bytes always has one,
+    /// which does not count.
+    fn padding_bytes(&self) -> Result<u64, Problem> {
+        let need = self.need_bytes();
+        let Some(have) = self.native_bytes else { return Ok(0) };
+        let remedy = match have {
+            have if have < need => "get the whole file",
+            // Another picture, or wider numbers than the header says.
+            have if have >= 2 * need && have > 4 => {
+                "correct Rows, Columns, BitsAllocated or NumberOfFrames, or convert the series"
+            }
+            _ => return Ok((have - need).saturating_sub(need % 2)),
+        };
+        Err(Problem::new(
+            OpenErrorKind::Damaged,
+            "PixelData",
+            format!("has {have} bytes, where Rows and Columns want {need}"),
+            remedy,
+        ))
+    }
+}
+
+/// Returns the number that a text begins with, such as 5 of `5 mm`; a comma may be its point.
+fn leading_number(text: &str) -> Option<f64> {
+    let text = text.trim_start().replace(',', ".");
+    let ends = text.char_indices().map(|(i, c)| i + c.len_utf8());
+    let longest = ends.rev().find_map(|end| text[..end].parse::<f64>().ok());
+    longest.filter(|x| x.is_finite())
 }
 
 /// Sorts the slices, checks that they agree, and returns the preface with their lattice.
@@ -308,13 +422,27 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
             "leave some out",
         ));
     }
-    if let Some(other) = slices.iter().find(|s| s.format != format) {
-        let wrong = Problem::malformed(
-            "BitsStored",
-            "is not what the first slice of its series has",
-            "leave it out, or convert the series",
-        );
-        return Err(in_file(&other.path, wrong));
+    let mut padded = Vec::new();
+    for slice in slices.iter() {
+        match slice.padding_bytes() {
+            Ok(0) => {}
+            Ok(bytes) => padded.push(bytes),
+            Err(problem) => return Err(in_file(&slice.path, problem)),
+        }
+    }
+    if let Some(most) = padded.iter().max() {
+        notes.push(format!(
+            "{} of {n} slices have up to {most} bytes of padding after their pixels, which were \
+             ignored",
+            padded.len()
+        ));
+    }
+    if slices.iter().any(|s| s.format != format) {
+        notes.push(format!(
+            "the slices of {} differ in BitsAllocated, BitsStored, HighBit or PixelRepresentation; \
+             each was read by its own",
+            quoted(&name)
+        ));
     }
     let dims = [u32::from(format.columns), u32::from(format.rows), count as u32];
     let placed = slices.iter().all(|s| s.place.is_some());
@@ -349,7 +477,10 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
                 let ends = [a, b].map(|s| s.place.expect("all have one").0);
                 (ends[1] - ends[0]) / (count as f64 - 1.0)
             }
-            _ => normal * slices[0].spacing[2],
+            _ => {
+                notes.extend(slices[0].thickness_note.clone());
+                normal * slices[0].spacing[2]
+            }
         };
         // LPS to RAS. Adding zero turns -0.0 into 0.0.
         let ras = |v: DVec3| v * DVec3::new(-1.0, -1.0, 1.0) + DVec3::ZERO;
@@ -360,6 +491,7 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
             "the slices of {} do not say where they lie; they are in the order of their numbers",
             quoted(&name)
         ));
+        notes.extend(slices[0].thickness_note.clone());
         Lattice::from_spacing(dims, slices[0].spacing)
     };
     lattice
@@ -368,15 +500,7 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
     // One rescale for all slices goes into the value map; several turn all samples into floats.
     let rescale = slices[0].rescale;
     let float = slices.iter().any(|s| s.rescale != rescale);
-    let number = match (float, format.allocated, format.signed) {
-        (true, ..) => Number::F32,
-        (_, 8, false) => Number::U8,
-        (_, 8, true) => Number::I8,
-        (_, 16, false) => Number::U16,
-        (_, 16, true) => Number::I16,
-        (_, _, false) => Number::U32,
-        (_, _, true) => Number::I32,
-    };
+    let number = if float { Number::F32 } else { common_number(slices.iter().map(|s| s.format)) };
     Ok(Preface {
         name,
         number,
@@ -388,20 +512,36 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
     })
 }
 
+/// Returns the type that holds the stored values of all formats.
+fn common_number(formats: impl Iterator<Item = PixelFormat> + Clone) -> Number {
+    let signed = formats.clone().any(|f| f.signed);
+    // Beside signed numbers an unsigned one needs a bit more than it has.
+    let bits = |f: PixelFormat| if signed && !f.signed { f.stored + 1 } else { f.allocated };
+    match (formats.map(bits).max().unwrap_or(32), signed) {
+        (..=8, false) => Number::U8,
+        (..=8, true) => Number::I8,
+        (..=16, false) => Number::U16,
+        (..=16, true) => Number::I16,
+        (_, false) => Number::U32,
+        (..=32, true) => Number::I32,
+        (_, true) => Number::I64,
+    }
+}
+
 /// Returns a length for people: not 300 digits of one that is out of this world.
 fn millimetres(x: f64) -> String {
     if x < 1e6 { format!("{x:.3}") } else { format!("{x:.3e}") }
 }
 
-/// Returns the samples of a slice, little-endian: as stored, or rescaled to f32 if `float`.
-fn pixels(slice: &Slice, float: bool) -> Result<Vec<u8>, Problem> {
+/// Returns the samples of a slice as little-endian numbers: as stored, or rescaled if they are f32.
+fn pixels(slice: &Slice, number: Number) -> Result<Vec<u8>, Problem> {
     let source = Source::open(&slice.path, "file")?;
     let len = source.len;
     let file = File::open(source)?;
     if Slice::from_file(&slice.path, &file)?.format != slice.format {
         return Err(Problem::malformed("file", "changed while it was read", "try again"));
     }
-    pixels_of(slice, file, len, float)
+    pixels_of(slice, file, len, number)
 }
 
 /// Returns the samples of a file, for the mutants of `fuzz.rs`.
@@ -409,43 +549,44 @@ fn pixels(slice: &Slice, float: bool) -> Result<Vec<u8>, Problem> {
 pub(crate) fn one_slice(source: Source) -> Result<Vec<u8>, Problem> {
     let len = source.len;
     let file = File::open(source)?;
-    pixels_of(&Slice::from_file(Path::new("slice"), &file)?, file, len, true)
+    pixels_of(&Slice::from_file(Path::new("slice"), &file)?, file, len, Number::F32)
 }
 
 /// Returns the samples of an open file of `len` bytes, like [`pixels`].
-fn pixels_of(slice: &Slice, mut file: File, len: u64, float: bool) -> Result<Vec<u8>, Problem> {
+fn pixels_of(slice: &Slice, mut file: File, len: u64, number: Number) -> Result<Vec<u8>, Problem> {
     let format = slice.format;
     let size = usize::from(format.allocated / 8);
     let count = usize::from(format.columns) * usize::from(format.rows);
     let bytes = match file.pixels {
         Pixels::Rle => rle::unpack(&mut *file.rest, count, size)?,
-        Pixels::Native(have) => {
+        Pixels::Native { bytes: have, words } => {
             let need = (count * size) as u64;
-            // An odd number of bytes is padded with one more.
-            if have < need || have > need + need % 2 || need / 1032 > len {
-                return Err(Problem::new(
-                    OpenErrorKind::Damaged,
-                    "PixelData",
-                    format!("has {have} bytes, where Rows and Columns want {need}"),
-                    "get the file again",
-                ));
+            slice.padding_bytes()?;
+            if need / 1032 > len {
+                return Err(crate::samples::truncated(need, len));
             }
+            // Bytes in words of 16 bits come in pairs, the last with padding.
+            let turned = size == 1 && words && file.endian == Endian::Big;
+            let stored = if turned { have.min(need + need % 2) } else { need };
             let mut bytes = Vec::new();
             file.rest
-                .take(need)
+                .take(stored)
                 .read_to_end(&mut bytes)
                 .map_err(|e| Problem::io("PixelData", &e))?;
-            if bytes.len() as u64 != need {
-                return Err(crate::samples::truncated(need, bytes.len() as u64));
+            if bytes.len() as u64 != stored {
+                return Err(crate::samples::truncated(stored, bytes.len() as u64));
             }
-            if file.endian == Endian::Big {
+            if turned {
+                bytes.chunks_exact_mut(2).for_each(<[u8]>::reverse);
+                bytes.truncate(need as usize);
+            } else if file.endian == Endian::Big {
                 bytes.chunks_exact_mut(size).for_each(<[u8]>::reverse);
             }
             bytes
         }
     };
     let whole = format.stored == format.allocated && format.high + 1 == format.allocated;
-    if whole && !float {
+    if whole && number == common_number(std::iter::once(format)) {
         return Ok(bytes);
     }
     // Bits outside the stored ones may hold anything, such as old overlays.
@@ -462,8 +603,9 @@ fn pixels_of(slice: &Slice, mut file: File, len: u64, float: bool) -> Result<Vec
     };
     let [slope, intercept] = slice.rescale;
     let words = bytes.chunks_exact(size).map(value);
-    Ok(match float {
+    let bytes = number.bytes() as usize;
+    Ok(match number == Number::F32 {
         true => words.flat_map(|v| ((v as f64 * slope + intercept) as f32).to_le_bytes()).collect(),
-        false => words.flat_map(|v| v.to_le_bytes().into_iter().take(size)).collect(),
+        false => words.flat_map(|v| v.to_le_bytes().into_iter().take(bytes)).collect(),
     })
 }

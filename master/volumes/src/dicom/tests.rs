@@ -81,7 +81,7 @@ pub(crate) fn slice(
     };
     put((8, 0x60), "CS", b"CT");
     put((8, 0x103e), "LO", &get("description", "thorax"));
-    put((0x18, 0x50), "DS", b"9");
+    put((0x18, 0x50), "DS", &get("thickness", "9"));
     put((0x20, 0xe), "UI", uid.as_bytes());
     put((0x20, 0x11), "IS", &get("number", "7"));
     put((0x20, 0x13), "IS", &get("instance", "1"));
@@ -96,7 +96,8 @@ pub(crate) fn slice(
     let stored: u16 = String::from_utf8(get("stored", "16")).unwrap().parse().unwrap();
     put((0x28, 0x101), "US", &short(stored));
     put((0x28, 0x102), "US", &short(stored - 1));
-    put((0x28, 0x103), "US", &short(1));
+    let signed: u16 = String::from_utf8(get("signed", "1")).unwrap().parse().unwrap();
+    put((0x28, 0x103), "US", &short(signed));
     put((0x28, 0x1052), "DS", &get("intercept", "-1024"));
     put((0x28, 0x1053), "DS", &get("slope", "1"));
     let words: Vec<u8> = pixels.iter().flat_map(|p| short(*p as u16)).collect();
@@ -117,7 +118,8 @@ pub(crate) fn slice(
         }
         body.extend([0xfe, 0xff, 0xdd, 0xe0, 0, 0, 0, 0]);
     } else {
-        put((0x7fe0, 0x10), "OW", &words);
+        let padding = String::from_utf8(get("padding", "0")).unwrap().parse().unwrap();
+        put((0x7fe0, 0x10), "OW", &[words, vec![0; padding]].concat());
     }
     if syntax == Syntax::Deflated {
         let mut z = flate2::write::DeflateEncoder::new(Vec::new(), flate2::Compression::fast());
@@ -236,7 +238,7 @@ fn dicom_errors_name_file_field_and_remedy() {
         (good(1.0)[..good(1.0).len() - 3].to_vec(), "truncated: 12 bytes are needed and 9"),
         (good(1.0)[..300].to_vec(), "`2` elements: truncated"),
         (swap(good(1.0), "1\\0\\0\\0\\1\\0", "1\\0\\0\\x\\1\\0"), "is not 6 numbers"),
-        (with(1.0, "stored", "12"), "BitsStored: is not what the first slice"),
+        (with(1.0, "padding", "12"), "`2` PixelData: has 24 bytes, where Rows and Columns want 12"),
     ] {
         let dir = folder(&[("1", good(0.0)), ("2", second)]);
         let e = crate::open(dir.path()).unwrap_err().to_string();
@@ -251,6 +253,12 @@ fn dicom_errors_name_file_field_and_remedy() {
     let dir = folder(&[("1", with(0.0, "frames", "30"))]);
     let e = crate::open(dir.path()).unwrap_err().to_string();
     assert!(e.contains("`1` NumberOfFrames: is above 1"), "{e}");
+    let e = good(1.0).len() - 12 - 4;
+    let mut short = good(1.0);
+    short[e..e + 4].copy_from_slice(&10u32.to_le_bytes());
+    let dir = folder(&[("1", good(0.0)), ("2", short)]);
+    let e = crate::open(dir.path()).unwrap_err().to_string();
+    assert!(e.contains("has 10 bytes, where Rows and Columns want 12; get the whole file"), "{e}");
     // Gaps are drawn as if they were even, and said.
     let dir = folder(&[("1", good(0.0)), ("2", good(1.0)), ("3", good(3.0))]);
     let opened = crate::open_with(dir.path(), &crate::Hints::default()).unwrap();
@@ -275,4 +283,123 @@ fn dicom_reader_process_failure_is_reported() {
         let e = crate::open_with(dir.path(), &hints).unwrap_err().to_string();
         assert!(e.contains(say) && e.contains("512 MiB"), "{e}");
     }
+}
+
+/// Values of a folder of slices that are 1 apart from 0 on, and the notes.
+fn read(slices: &[Vec<u8>]) -> (Vec<f64>, Vec<String>) {
+    let names: Vec<String> = (0..slices.len()).map(|i| i.to_string()).collect();
+    let files: Vec<_> = names.iter().map(String::as_str).zip(slices.iter().cloned()).collect();
+    let dir = folder(&files);
+    let opened = crate::open_with(dir.path(), &crate::Hints::default());
+    let opened = opened.unwrap_or_else(|e| panic!("{e}"));
+    let v = opened.volume;
+    let count = v.lattice.len();
+    ((0..count).map(|i| v.summary.map.value(v.samples.code(i))).collect(), opened.notes)
+}
+
+#[test]
+fn dicom_bits_and_sign_hold_for_one_slice_each() {
+    let s = |z, words: &[i16], stored, signed| {
+        let more = [("stored", stored), ("signed", signed), ("intercept", "0")];
+        slice(Syntax::Explicit, "1", z, words, &more)
+    };
+    // Bits above the stored ones are not the value's.
+    let (values, notes) = read(&[
+        s(0.0, &[0x7fff, 1, 2], "11", "0"),
+        s(1.0, &[0x7fff, 1, 2], "12", "0"),
+        s(2.0, &[-1, 1, 2], "12", "1"),
+    ]);
+    assert_eq!(values, [2047.0, 1.0, 2.0, 4095.0, 1.0, 2.0, -1.0, 1.0, 2.0]);
+    assert!(notes[0].contains("PixelRepresentation; each was read by its own"), "{notes:?}");
+    // All 16 bits of both kinds need more than 16.
+    let (values, _) = read(&[s(0.0, &[-1, 0, 1], "16", "0"), s(1.0, &[-1, 0, 1], "16", "1")]);
+    assert_eq!(values, [65535.0, 0.0, 1.0, -1.0, 0.0, 1.0]);
+}
+
+#[test]
+fn dicom_wordings_that_do_not_matter_are_not_refused() {
+    let s = |z, more: &[(&str, &str)]| slice(Syntax::Implicit, "1", z, &pixels(0), more);
+    for more in [
+        ("thickness", "5 mm"),
+        ("thickness", "thin"),
+        ("frames", "01"),
+        ("frames", "+1"),
+        ("frames", "0"),
+    ] {
+        let (values, notes) = read(&[s(0.0, &[more]), s(1.0, &[more])]);
+        assert_eq!((values.len(), notes), (12, vec![]), "{more:?}");
+    }
+    // A lone slice has no other distance.
+    for (thickness, say) in [
+        ("5 mm", "SliceThickness is `5 mm`, and 5 mm was taken"),
+        ("2,5", "SliceThickness is `2,5`, and 2.5 mm was taken"),
+        ("thin", "SliceThickness is `thin`, which is no length; 1 mm was assumed"),
+        ("0", "no distance of slices is given; 1 mm was assumed"),
+    ] {
+        let (_, notes) = read(&[s(0.0, &[("thickness", thickness)])]);
+        assert_eq!(notes, [say]);
+    }
+    let (values, notes) = read(&[s(0.0, &[]), s(1.0, &[("padding", "8")])]);
+    assert_eq!(values.len(), 12);
+    let say = "1 of 2 slices have up to 8 bytes of padding after their pixels, which were ignored";
+    assert_eq!(notes, [say]);
+}
+
+#[test]
+fn dicom_bytes_in_big_endian_words_are_turned() {
+    // Three columns of one row: the fourth byte is padding.
+    let turn = |kind: &[u8; 2]| {
+        let mut file = slice(Syntax::Big, "1", 0.0, &[0, 0, 0], &[("intercept", "0")]);
+        let at = |file: &[u8], w: &[u8]| file.windows(w.len()).position(|x| x == w).unwrap();
+        for (tag, value) in [(0x100u16, 8u16), (0x101, 8), (0x102, 7), (0x103, 0)] {
+            let tag = [&0x28u16.to_be_bytes()[..], &tag.to_be_bytes(), b"US"].concat();
+            let at = at(&file, &tag) + 8;
+            file[at..at + 2].copy_from_slice(&value.to_be_bytes());
+        }
+        let pixels = at(&file, &[0x7f, 0xe0, 0, 0x10]);
+        file.truncate(pixels);
+        file.extend([0x7f, 0xe0, 0, 0x10, kind[0], kind[1], 0, 0, 0, 0, 0, 4, 1, 2, 3, 4]);
+        read(&[file]).0
+    };
+    assert_eq!(turn(b"OW"), [2.0, 1.0, 4.0]);
+    assert_eq!(turn(b"OB"), [1.0, 2.0, 3.0]);
+}
+
+#[test]
+fn dicom_series_can_be_chosen_by_all_that_a_message_shows() {
+    let long = |last: char| format!("1.2.826.0.1.3680043.8.498.{last}{}", "7".repeat(37));
+    let (one, two) = (long('1'), long('2'));
+    let axial = [("description", "t1")];
+    let coronal = [("description", "t1"), ("orientation", "1\\0\\0\\0\\0\\1")];
+    let s = |uid: &str, more| slice(Syntax::Explicit, uid, 0.0, &pixels(0), more);
+    let words = "a description as long as the standard lets it be, sixty-four, i.e.";
+    let dir = folder(&[
+        ("1", s(&one, &axial)),
+        ("2", s(&two, &axial)),
+        ("3", s(&two, &coronal)),
+        ("4", s("1.9", &[("description", words)])),
+    ]);
+    let open = |series: Option<&str>| {
+        let series = series.map(String::from);
+        crate::open_with(dir.path(), &crate::Hints { series, ..crate::Hints::default() })
+    };
+    let e = open(None).unwrap_err().to_string();
+    let list = e.split("4 series: ").nth(1).unwrap();
+    let list = list.split("; name one").next().unwrap();
+    let mut places = Vec::new();
+    for entry in list.split("), ") {
+        // The UID where there is one, else the name.
+        let shown = entry.split('`').nth(if entry.contains("UID") { 3 } else { 1 }).unwrap();
+        let opened = open(Some(shown)).unwrap_or_else(|e| panic!("{shown}: {e}"));
+        places.push(format!("{} {:?}", opened.volume.name, opened.volume.lattice.steps));
+    }
+    assert_eq!(places.len(), 4, "{list}");
+    assert!(list.contains(&one) && list.contains(&format!("{two}/2")), "{list}");
+    places.sort();
+    places.dedup();
+    assert_eq!(places.len(), 3, "only one and two/1 look alike: {places:?}");
+    // The beginning of a UID, as far as it is unique.
+    assert!(open(Some("1.9")).is_ok() && open(Some(&format!("{}...", &one[..63]))).is_ok());
+    let e = open(Some("1.2.826")).unwrap_err().to_string();
+    assert!(e.contains("3 series are called `1.2.826`"), "{e}");
 }

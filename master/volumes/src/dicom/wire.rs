@@ -34,8 +34,16 @@ const KINDS: [(OpenErrorKind, &str); 7] = [
     (OpenErrorKind::Damaged, "damaged"),
 ];
 
-const NUMBERS: [Number; 7] =
-    [Number::U8, Number::I8, Number::U16, Number::I16, Number::U32, Number::I32, Number::F32];
+const NUMBERS: [Number; 8] = [
+    Number::U8,
+    Number::I8,
+    Number::U16,
+    Number::I16,
+    Number::U32,
+    Number::I32,
+    Number::I64,
+    Number::F32,
+];
 
 /// Replaces control characters, so that the text is one line.
 fn one_line(text: &str) -> String {

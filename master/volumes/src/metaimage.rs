@@ -4,12 +4,12 @@
 //! Documentation: itk.org/Wiki/MetaIO/Documentation. A header is lines of `Key = Value`, the last
 //! of them `ElementDataFile`. Where the documentation is silent this follows ITK's reader, since
 //! ITK writes nearly all such files: rows of `TransformMatrix` are the directions of the index
-//! axes, space is LPS, and `CenterOfRotation` is ignored.
+//! axes, space is LPS (also without a matrix), and `CenterOfRotation` is ignored.
 
 use crate::data::{self, HeaderLines, Skip, Storage};
 use crate::error::{Problem, quoted};
 use crate::samples::{Endian, Layout, Number};
-use crate::source::Source;
+use crate::source::{Notes, Source};
 use crate::unpack::Encoding;
 use glam::DVec3;
 use slabcast_common::volume::{Lattice, Volume};
@@ -19,12 +19,28 @@ use std::path::Path;
 /// Key of the header's last line, in lower case.
 const DATA_FILE: &str = "elementdatafile";
 
-/// Returns whether the first bytes are a header: a known key and an equals sign.
+/// Returns whether the first bytes are a header: a known key and an equals sign, after
+/// comments.
 pub(crate) fn sniff(head: &[u8]) -> bool {
-    let line = head.split(|b| *b == b'\n').next().unwrap_or_default();
+    let text = |line: &[u8]| !line.trim_ascii().is_empty() && !line.starts_with(b"#");
+    let Some(line) = head.split(|b| *b == b'\n').find(|line| text(line)) else { return false };
     let Some(equals) = line.iter().position(|b| *b == b'=') else { return false };
     let key = String::from_utf8_lossy(&line[..equals]).trim().to_ascii_lowercase();
-    matches!(key.as_str(), "objecttype" | "ndims" | "comment" | "objectsubtype")
+    matches!(
+        key.as_str(),
+        "objecttype"
+            | "objectsubtype"
+            | "ndims"
+            | "comment"
+            | "name"
+            | "id"
+            | "transformtype"
+            | "binarydata"
+            | "compresseddata"
+            | "dimsize"
+            | "elementtype"
+            | "elementspacing"
+    )
 }
 
 /// Reads a volume from the start of a source. `folder` is the header's folder, where detached data
@@ -32,7 +48,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volume, Problem> {
     let (fields, header_bytes) = Fields::read(&mut source)?;
     let layout = layout(&fields)?;
-    let (lattice, anatomical) = lattice(&fields, layout.dims)?;
+    let (lattice, anatomical) = lattice(&fields, layout.dims, &source.notes)?;
     let storage = storage(&fields)?;
     let (samples, map) = match data_files(&fields, layout.dims)? {
         None => {
@@ -69,7 +85,7 @@ impl Fields {
                 return Err(Problem::malformed("ElementDataFile", "is missing", END));
             };
             let text = text.trim();
-            if text.is_empty() {
+            if text.is_empty() || !in_list && text.starts_with('#') {
                 continue;
             }
             if in_list {
@@ -87,10 +103,11 @@ impl Fields {
             let lower = key.to_ascii_lowercase();
             let last = lower == DATA_FILE;
             in_list = last && value.split_ascii_whitespace().next() == Some("LIST");
-            if let Some((before, ..)) = lines.insert(lower, (number, key.to_string(), value)) {
+            let again = lines.insert(lower, (number, key.to_string(), value.clone()));
+            if let Some((before, ..)) = again.filter(|(.., other)| *other != value) {
                 return Err(Problem::malformed(
                     format!("line {number}"),
-                    format!("{} was given in line {before} already", quoted(key)),
+                    format!("{} was given in line {before} with another value", quoted(key)),
                     "remove one of them",
                 ));
             }
@@ -133,13 +150,13 @@ impl Fields {
         }
     }
 
-    /// Parses `N` numbers; `None` if no key is present.
-    fn numbers<const N: usize>(&self, keys: &[&str]) -> Result<Option<[f64; N]>, Problem> {
+    /// Parses `n` numbers; `None` if no key is present.
+    fn numbers(&self, keys: &[&str], n: usize) -> Result<Option<Vec<f64>>, Problem> {
         let Some((key, value)) = self.get(keys) else { return Ok(None) };
         let numbers: Result<Vec<f64>, _> = value.split_ascii_whitespace().map(str::parse).collect();
-        match numbers.map(<[f64; N]>::try_from) {
-            Ok(Ok(numbers)) => Ok(Some(numbers)),
-            _ => Err(self.bad(key, &format!("is not {N} numbers"), "correct it")),
+        match numbers {
+            Ok(numbers) if numbers.len() == n => Ok(Some(numbers)),
+            _ => Err(self.bad(key, &format!("is not {n} numbers"), "correct it")),
         }
     }
 }
@@ -150,10 +167,7 @@ fn layout(fields: &Fields) -> Result<Layout, Problem> {
     {
         return Err(fields.bad(key, "is not an image", "give a MetaImage of ObjectType Image"));
     }
-    let axes = fields.required("NDims", "3")?;
-    if axes.parse() != Ok(3u32) {
-        return Err(fields.bad("NDims", "is not 3", "save one volume of it with three axes"));
-    }
+    let axes = axes(fields)?;
     if let Some((key, value)) = fields.get(&["ElementNumberOfChannels"])
         && value.parse() != Ok(1u32)
     {
@@ -192,11 +206,33 @@ fn layout(fields: &Fields) -> Result<Layout, Problem> {
         .split_ascii_whitespace()
         .map(str::parse)
         .collect::<Result<_, _>>()
-        .map_err(|_| fields.bad("DimSize", "is not three whole numbers", "correct it"))?;
-    let dims: [u64; 3] = sizes
-        .try_into()
-        .map_err(|_| fields.bad("DimSize", "is not three whole numbers", "correct it"))?;
+        .map_err(|_| fields.bad("DimSize", "is not whole numbers", "correct it"))?;
+    if sizes.len() != axes {
+        return Err(fields.bad("DimSize", &format!("is not {axes} whole numbers"), "correct it"));
+    }
+    let (dims, more) = sizes.split_first_chunk::<3>().expect("there are three axes or more");
+    if more.iter().any(|&n| n != 1) {
+        return Err(fields.bad(
+            "DimSize",
+            "is more than one volume",
+            "save one volume of it with three axes",
+        ));
+    }
+    let dims = *dims;
     Layout::new(dims, number, endian, "DimSize")
+}
+
+/// Returns the number of axes. Those after the third have one sample.
+fn axes(fields: &Fields) -> Result<usize, Problem> {
+    match fields.required("NDims", "3")?.parse() {
+        Ok(axes @ 3..=16) => Ok(axes),
+        Ok(1..=2) => Err(fields.bad(
+            "NDims",
+            "axes make a picture, not a volume",
+            "stack its pictures, and save a volume of three axes",
+        )),
+        _ => Err(fields.bad("NDims", "is not 3", "save one volume of it with three axes")),
+    }
 }
 
 fn storage(fields: &Fields) -> Result<Storage, Problem> {
@@ -270,28 +306,47 @@ fn data_files(fields: &Fields, dims: [u32; 3]) -> Result<Option<Vec<String>>, Pr
     Ok(Some(names))
 }
 
-/// Returns the lattice in RAS+, and whether its axes are anatomical.
-fn lattice(fields: &Fields, dims: [u32; 3]) -> Result<(Lattice, bool), Problem> {
+/// Returns the lattice in RAS+, and whether its axes are anatomical. Axes after the third are time
+/// or channels, of one sample.
+fn lattice(fields: &Fields, dims: [u32; 3], notes: &Notes) -> Result<(Lattice, bool), Problem> {
+    let n = axes(fields)?;
+    let three = |v: &[f64]| DVec3::new(v[0], v[1], v[2]);
     // ITK writes ElementSpacing; ElementSize, the size of a sample, serves where it is absent.
-    let spacing = fields.numbers::<3>(&["ElementSpacing", "ElementSize"])?.unwrap_or([1.0; 3]);
-    let rows = fields.numbers::<9>(&["TransformMatrix", "Rotation", "Orientation"])?;
-    let origin = fields.numbers::<3>(&["Offset", "Position", "Origin"])?.unwrap_or([0.0; 3]);
-    let mut lattice = Lattice::from_spacing(dims, spacing);
-    let Some(m) = rows else {
-        // With spacings alone the file does not say where its axes point.
-        lattice.origin = DVec3::from_array(origin);
-        lattice.check().map_err(|e| {
-            Problem::malformed("ElementSpacing", e, "correct the spacing or the offset")
-        })?;
-        return Ok((lattice, false));
-    };
+    let spacing = fields.numbers(&["ElementSpacing", "ElementSize"], n)?;
+    let spacing = spacing.map_or(DVec3::ONE, |v| three(&v));
+    const MATRIX: [&str; 3] = ["TransformMatrix", "Rotation", "Orientation"];
+    let rows = fields.numbers(&MATRIX, n * n)?;
+    let origin = fields.numbers(&["Offset", "Position", "Origin"], n)?;
+    let origin = origin.map_or(DVec3::ZERO, |v| three(&v));
     // LPS to RAS. Adding zero turns -0.0 into 0.0, which the digest would distinguish.
     let ras = |v: DVec3| v * DVec3::new(-1.0, -1.0, 1.0) + DVec3::ZERO;
-    for a in 0..3 {
-        lattice.steps[a] = ras(DVec3::new(m[3 * a], m[3 * a + 1], m[3 * a + 2]) * spacing[a]);
-    }
-    lattice.origin = ras(DVec3::from_array(origin));
-    lattice.check().map_err(|e| Problem::malformed("TransformMatrix", e, "correct the axes"))?;
+    let mut lattice = Lattice::from_spacing(dims, spacing.to_array());
+    lattice.origin = ras(origin);
+    let field = match &rows {
+        Some(rows) => {
+            for (a, row) in rows.chunks_exact(n).take(3).enumerate() {
+                if row[3..].iter().any(|x| *x != 0.0) {
+                    let (key, _) = fields.get(&MATRIX).expect("it was parsed above");
+                    return Err(fields.bad(
+                        key,
+                        "leads out of the space of its first three axes",
+                        "save one volume of it with three axes",
+                    ));
+                }
+                lattice.steps[a] = ras(three(row) * spacing[a]);
+            }
+            "TransformMatrix"
+        }
+        None => {
+            lattice.steps = lattice.steps.map(ras);
+            notes.add(
+                "the file has no TransformMatrix; its axes were taken to run to the left, to \
+                 posterior and to superior (LPS), as ITK does",
+            );
+            "ElementSpacing"
+        }
+    };
+    lattice.check().map_err(|e| Problem::malformed(field, e, "correct the axes"))?;
     Ok((lattice, true))
 }
 

@@ -361,6 +361,15 @@ impl Axes {
             })?;
         let mut kept: Vec<usize> = (0..count).collect();
         // Drop axes of one sample, first those that the file marks as not spatial.
+        let list = sizes.iter().map(u64::to_string).collect::<Vec<_>>().join(" x ");
+        if count < 3 {
+            let what = if count == 2 { "a picture of two axes" } else { "a row of one axis" };
+            return Err(Problem::unsupported(
+                fields.with_line("dimension"),
+                format!("{list} samples are {what}, not a volume"),
+                "stack its pictures, and save a volume of three axes",
+            ));
+        }
         let directions = match fields.get("space directions") {
             Some(_) => vectors(fields, "space directions", None)?,
             None => Vec::new(),
@@ -368,11 +377,43 @@ impl Axes {
         let kinds: Vec<&str> =
             fields.get("kinds").unwrap_or_default().split_ascii_whitespace().collect();
         let outside_space = |a: usize| {
-            matches!(directions.get(a), Some(None))
+            // An axis along the fourth dimension of a space is one of time.
+            let flat =
+                |d: &Option<Direction>| d.as_ref().is_none_or(|d| d.xyz == DVec3::ZERO && d.more);
+            directions.get(a).is_some_and(flat)
                 || !matches!(
                     kinds.get(a).map(|k| k.to_ascii_lowercase()).as_deref(),
                     None | Some("domain" | "space" | "???" | "none")
                 )
+        };
+        let no_space = |axis: usize| {
+            let direction = directions.get(axis);
+            let (field, is) = match (kinds.get(axis), direction) {
+                (_, Some(None)) => ("space directions", "`none`".to_string()),
+                (_, Some(Some(d))) if d.more => {
+                    ("space directions", "along the fourth dimension".to_string())
+                }
+                (kind, _) => ("kinds", quoted(kind.unwrap_or(&"none"))),
+            };
+            let size = sizes[axis];
+            let which = match ["the first axis", "the second axis", "the third axis"].get(axis) {
+                Some(which) => which.to_string(),
+                None => format!("axis {}", axis + 1),
+            };
+            Problem::unsupported(
+                fields.with_line(field),
+                format!(
+                    "{which} of {list} is no axis of space: {is}, {size} sample{}",
+                    if size == 1 { "" } else { "s" }
+                ),
+                match field {
+                    "kinds" => {
+                        "save one of its components or times as a volume of three axes, or call it \
+                         `domain` if it is one of space"
+                    }
+                    _ => "save one of its components or times as a volume of three axes",
+                },
+            )
         };
         while kept.len() > 3 {
             let single = |a: &usize| sizes[*a] == 1;
@@ -381,7 +422,9 @@ impl Axes {
                 .rposition(|a| single(a) && outside_space(*a))
                 .or_else(|| kept.iter().rposition(single));
             let Some(index) = dropped else {
-                let list = sizes.iter().map(u64::to_string).collect::<Vec<_>>().join(" x ");
+                if let Some(&axis) = kept.iter().find(|a| outside_space(**a)) {
+                    return Err(no_space(axis));
+                }
                 return Err(Problem::unsupported(
                     fields.with_line("dimension"),
                     format!("{list} has {} axes of more than one sample", kept.len()),
@@ -390,13 +433,10 @@ impl Axes {
             };
             kept.remove(index);
         }
-        let Ok(kept) = <[usize; 3]>::try_from(kept) else {
-            return Err(Problem::unsupported(
-                fields.with_line("dimension"),
-                format!("{count} axes make no volume"),
-                "save it with three axes",
-            ));
-        };
+        if let Some(&axis) = kept.iter().find(|a| outside_space(**a)) {
+            return Err(no_space(axis));
+        }
+        let kept = <[usize; 3]>::try_from(kept).expect("three of three or more axes are left");
         Ok(Axes { count, kept, sizes: kept.map(|a| sizes[a]), all: sizes })
     }
 }
@@ -447,13 +487,14 @@ fn lattice_from_directions(
     let all = vectors(fields, "space directions", Some(axes.count))?;
     let mut steps = [DVec3::ZERO; 3];
     for (a, &axis) in axes.kept.iter().enumerate() {
-        steps[a] = all[axis].ok_or_else(|| {
+        let direction = all[axis].filter(|d| !d.more).ok_or_else(|| {
             fields.malformed(
                 "space directions",
-                &format!("has no direction for axis {axis}, which is kept"),
+                &format!("does not say where axis {} runs in three dimensions", axis + 1),
                 "save a volume with three axes in space",
             )
         })?;
+        steps[a] = direction.xyz;
     }
     Ok(Lattice { dims, steps, origin: origin(fields)?.unwrap_or(DVec3::ZERO) })
 }
@@ -462,15 +503,28 @@ fn origin(fields: &Fields) -> Result<Option<DVec3>, Problem> {
     if fields.get("space origin").is_none() {
         return Ok(None);
     }
-    Ok(vectors(fields, "space origin", Some(1))?[0])
+    Ok(vectors(fields, "space origin", Some(1))?[0].map(|v| v.xyz))
 }
 
-/// Parses vectors such as `(1,0,0) none (0,0,1)`; `count` is how many there must be.
+/// A vector of a space of three dimensions or more.
+#[derive(Clone, Copy)]
+struct Direction {
+    xyz: DVec3,
+    /// Whether it leads into a dimension after the third.
+    more: bool,
+}
+
+/// Parses vectors such as `(1,0,0) none (0,0,1)`; `count` is how many there must be. In a space of
+/// four dimensions they have four numbers.
 fn vectors(
     fields: &Fields,
     name: &str,
     count: Option<usize>,
-) -> Result<Vec<Option<DVec3>>, Problem> {
+) -> Result<Vec<Option<Direction>>, Problem> {
+    let dimensions = match fields.get("space dimension").map(str::parse) {
+        Some(Ok(n @ 3..=AXES_MAX)) => n,
+        _ => 3 + usize::from(fields.get("space").is_some_and(has_time)),
+    };
     let bad = || fields.malformed(name, "is not made of vectors (x,y,z)", "correct the vectors");
     let mut rest = fields.get(name).unwrap_or_default().trim_start();
     let mut found = Vec::new();
@@ -487,8 +541,12 @@ fn vectors(
             .map(|w| w.trim().parse::<f64>())
             .collect::<Result<_, _>>()
             .map_err(|_| bad())?;
-        let xyz: [f64; 3] = numbers.try_into().map_err(|_| bad())?;
-        found.push(Some(DVec3::from_array(xyz)));
+        let (&[x, y, z], more) = numbers.split_first_chunk::<3>().ok_or_else(bad)?;
+        if numbers.len() != dimensions {
+            return Err(bad());
+        }
+        let more = more.iter().any(|x| *x != 0.0);
+        found.push(Some(Direction { xyz: DVec3::new(x, y, z), more }));
         rest = after.trim_start();
     }
     if count.is_some_and(|n| n != found.len()) {
@@ -513,26 +571,25 @@ fn space(fields: &Fields) -> Result<Option<Space>, Problem> {
     let Some(name) = fields.get("space") else {
         return match fields.get("space dimension") {
             None => Ok(None),
-            Some("3") => Ok(Some(Space { signs: DVec3::ONE, anatomical: false })),
+            // A volume of one time needs three of four.
+            Some("3" | "4") => Ok(Some(Space { signs: DVec3::ONE, anatomical: false })),
             Some(_) => {
                 Err(fields.malformed("space dimension", "is not 3", "save it in a space of three"))
             }
         };
     };
-    Ok(match name.to_ascii_lowercase().as_str() {
+    let lower = name.to_ascii_lowercase();
+    let three = match lower.as_str() {
+        "rast" | "last" | "lpst" => &lower[..3],
+        name => name.strip_suffix("-time").unwrap_or(name),
+    };
+    Ok(match three {
         "right-anterior-superior" | "ras" => anatomical(1.0, 1.0, 1.0),
         "left-anterior-superior" | "las" => anatomical(-1.0, 1.0, 1.0),
         "left-posterior-superior" | "lps" => anatomical(-1.0, -1.0, 1.0),
         "scanner-xyz" | "3d-right-handed" => Some(Space { signs: DVec3::ONE, anatomical: false }),
         // The world is right-handed: without the sign it would be drawn mirrored.
         "3d-left-handed" => Some(Space { signs: DVec3::new(1.0, 1.0, -1.0), anatomical: false }),
-        other if other.ends_with("-time") || matches!(other, "rast" | "last" | "lpst") => {
-            return Err(Problem::unsupported(
-                fields.with_line("space"),
-                format!("{} has four dimensions", quoted(name)),
-                "save one time step in a space of three",
-            ));
-        }
         _ => {
             return Err(fields.malformed(
                 "space",
@@ -541,6 +598,12 @@ fn space(fields: &Fields) -> Result<Option<Space>, Problem> {
             ));
         }
     })
+}
+
+/// Returns whether a space has a fourth dimension, time.
+fn has_time(space: &str) -> bool {
+    let lower = space.to_ascii_lowercase();
+    lower.ends_with("-time") || matches!(lower.as_str(), "rast" | "last" | "lpst")
 }
 
 /// Returns the millimetres of one unit of length; 1 unless all axes have the same known unit.

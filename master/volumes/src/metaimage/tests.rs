@@ -39,8 +39,37 @@ fn metaimage_transform_matrix_rows_are_index_axes_in_lps() {
     assert_eq!(v.lattice.origin, DVec3::new(-4.0, -5.0, 6.0));
     let v = open(&format!("{HEAD}ElementSize = 1 2 3\nElementDataFile=LOCAL\n"), &[0; 6]);
     let v = v.unwrap();
-    assert!(!v.anatomical, "spacings alone do not say where the axes point");
-    assert_eq!(v.lattice.spacing(), [1.0, 2.0, 3.0]);
+    assert!(v.anatomical, "ITK takes the identity in LPS");
+    assert_eq!(v.lattice.steps, [-DVec3::X, DVec3::Y * -2.0, DVec3::Z * 3.0]);
+}
+
+#[test]
+fn metaimage_axes_of_one_sample_after_the_third_are_dropped() {
+    let four = "ObjectType = Image\nNDims = 4\nDimSize = 3 2 1 1\nElementType = MET_UCHAR\n";
+    let place = "TransformMatrix = -1 0 0 0 0 -1 0 0 0 0 1 0 0 0 0 1\nOffset = 31.5 -12.25 7 0\n\
+                 ElementSpacing = 1 2 3 9\n";
+    let v = open(&format!("{four}{place}ElementDataFile = LOCAL\n"), &[0; 6]).unwrap();
+    assert_eq!(v.lattice.dims, [3, 2, 1]);
+    assert_eq!(v.lattice.steps, [DVec3::X, DVec3::Y * 2.0, DVec3::Z * 3.0]);
+    assert_eq!(v.lattice.origin, DVec3::new(-31.5, 12.25, 7.0));
+    for (from, to, say) in [
+        ("3 2 1 1", "1 2 1 3", "DimSize (line 3): `1 2 1 3` is more than one volume"),
+        ("3 2 1 1", "3 2 1", "is not 4 whole numbers"),
+        ("0 0 1 0 0", "0 0 1 5 0", "leads out of the space of its first three axes"),
+        ("NDims = 4", "NDims = 2", "NDims (line 2): `2` axes make a picture, not a volume"),
+    ] {
+        let head = format!("{four}{place}ElementDataFile = LOCAL\n").replace(from, to);
+        let e = open(&head, &[0; 6]).unwrap_err().to_string();
+        assert!(e.contains(say), "want {say:?} in {e}");
+    }
+}
+
+#[test]
+fn metaimage_headers_may_have_comments_and_say_a_thing_twice() {
+    let head = format!("# made by me\n\n{HEAD}#NDims = 9\nNDims = 3\nElementDataFile = LOCAL\n");
+    assert_eq!(open(&head, &[7; 6]).unwrap().samples, Samples::U8(vec![7; 6]));
+    let v = open(&head.replace("ObjectType = Image\n", ""), &[7; 6]).unwrap();
+    assert_eq!(v.lattice.dims, [3, 2, 1]);
 }
 
 #[test]
@@ -69,11 +98,11 @@ fn metaimage_errors_name_field_and_remedy() {
     for (header, say) in [
         (HEAD.to_string(), "line 5: `\\0\\0\\0\\0\\0\\0` is not `Key = Value`"),
         (with("Image", "Tube"), "ObjectType (line 1): `Tube` is not an image"),
-        (with("NDims = 3", "NDims = 4"), "NDims (line 2): `4` is not 3"),
+        (with("NDims = 3", "NDims = 4"), "`3 2 1` is not 4 whole numbers"),
         (with("DimSize = 3 2 1\n", ""), "DimSize: is missing"),
-        (with("3 2 1", "3 2"), "`3 2` is not three whole numbers"),
+        (with("3 2 1", "3 2"), "`3 2` is not 3 whole numbers"),
         (with("3 2 1", "3 0 1"), "3 x 0 x 1 has no samples"),
-        (with("3 2 1", "3 2 -1"), "is not three whole numbers"),
+        (with("3 2 1", "3 2 -1"), "is not whole numbers"),
         (with("MET_UCHAR", "MET_STRING"), "ElementType (line 4): `MET_STRING` is not a type"),
         (with("ElementDataFile", "CompressedData = Maybe\nElementDataFile"), "give True or False"),
         (with("ElementDataFile", "ElementSpacing = 1 1\nElementDataFile"), "is not 3 numbers"),
@@ -89,7 +118,7 @@ fn metaimage_errors_name_field_and_remedy() {
             with("ElementDataFile", "ElementNumberOfChannels = 3\nElementDataFile"),
             "save one channel",
         ),
-        (with("ElementDataFile", "NDims = 3\nElementDataFile"), "was given in line 2 already"),
+        (with("ElementDataFile", "NDims = 4\nElementDataFile"), "was given in line 2 with another"),
         (with("ElementDataFile", "HeaderSize = x\nElementDataFile"), "is not a number of bytes"),
         (with("LOCAL", "no.raw"), "ElementDataFile: `no.raw` is not there"),
         (with("LOCAL", "../x.raw"), "ElementDataFile"),

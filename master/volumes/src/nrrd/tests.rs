@@ -70,6 +70,74 @@ fn nrrd_spaces_become_ras() {
 }
 
 #[test]
+fn nrrd_axes_of_colours_vectors_and_time_are_no_axes_of_space() {
+    let head = |sizes: &str, more: &str| {
+        let n = sizes.split(' ').count();
+        format!("type: uint8\ndimension: {n}\nsizes: {sizes}\nencoding: raw\n{more}")
+    };
+    for kind in [
+        "RGB-color",
+        "3-color",
+        "vector",
+        "list",
+        "point",
+        "time",
+        "complex",
+        "3-vector",
+        "RGBA-color",
+        "scalar",
+        "normal",
+        "covariant-vector",
+        "2D-symmetric-matrix",
+    ] {
+        let e = open(&head("3 2 1", &format!("kinds: {kind} domain domain\n")), &[0; 6]);
+        let e = e.unwrap_err().to_string();
+        let say =
+            format!("kinds (line 6): the first axis of 3 x 2 x 1 is no axis of space: `{kind}`");
+        assert!(e.contains(&say) && e.contains("save one of its components"), "{e}");
+        // What it says also works.
+        assert!(open(&head("3 2 1", "kinds: domain domain domain\n"), &[0; 6]).is_ok());
+    }
+    for (sizes, more, say) in [
+        ("3 2 1 1", "kinds: list domain domain domain\n", "no axis of space: `list`, 3 samples"),
+        ("1 3 2", "kinds: scalar space space\n", "no axis of space: `scalar`, 1 sample"),
+        ("3 2 1", "space directions: none (1,0,0) (0,1,0)\n", "no axis of space: `none`"),
+        ("2 3 2 2", "kinds: vector space space space\n", "the first axis of 2 x 3 x 2 x 2"),
+        ("3 2", "", "3 x 2 samples are a picture of two axes, not a volume; stack"),
+        ("3 2", "space directions: (1,0) (0,1)\nspace dimension: 2\n", "a picture of two axes"),
+        ("6", "", "6 samples are a row of one axis"),
+    ] {
+        let e = open(&head(sizes, more), &[0; 24]).unwrap_err().to_string();
+        assert!(e.contains(say), "want {say:?} in {e}");
+    }
+}
+
+#[test]
+fn nrrd_volume_of_one_time_is_read_from_four_dimensions() {
+    let four = RAW.replace("dimension: 3", "dimension: 4").replace("3 2 1", "3 2 1 1");
+    let place = "space directions: (-1,0,0,0) (0,-2,0,0) (0,0,3,0) (0,0,0,1)\n\
+                 space origin: (4,5,6,0)\n";
+    let read = |more: &str| open(&format!("{four}{place}{more}"), &[0; 6]);
+    let v = read("space dimension: 4\n").unwrap();
+    assert_eq!(v.lattice.dims, [3, 2, 1]);
+    assert_eq!(v.lattice.steps, [-DVec3::X, DVec3::Y * -2.0, DVec3::Z * 3.0]);
+    assert_eq!((v.lattice.origin, v.anatomical), (DVec3::new(4.0, 5.0, 6.0), false));
+    let v = read("space: left-posterior-superior-time\n").unwrap();
+    assert_eq!((v.lattice.origin, v.anatomical), (DVec3::new(-4.0, -5.0, 6.0), true));
+    assert!(read("space: LPST\n").unwrap().anatomical);
+    // Times are no slices, however many there are.
+    let times = format!("{four}{place}space dimension: 4\n").replace("3 2 1 1", "3 2 1 2");
+    let e = open(&times, &[0; 12]).unwrap_err().to_string();
+    assert!(
+        e.contains("axis 4 of 3 x 2 x 1 x 2 is no axis of space: along the fourth dimension"),
+        "{e}"
+    );
+    let skew = format!("{four}{place}space dimension: 4\n").replace("(0,0,3,0)", "(0,0,3,1)");
+    let e = open(&skew, &[0; 6]).unwrap_err().to_string();
+    assert!(e.contains("does not say where axis 3 runs in three dimensions"), "{e}");
+}
+
+#[test]
 fn nrrd_drops_axes_of_one_sample() {
     let data: Vec<u8> = (0..6).collect();
     let want = open(&format!("{RAW}spacings: 1 2 3\n"), &data).unwrap();
@@ -235,11 +303,17 @@ fn nrrd_errors_name_field_and_remedy() {
         (format!("{RAW}spacings: 1 1 0\n"), "spacings (line 6): a spacing is zero"),
         (format!("{RAW}spacings: 1 1 x\n"), "has something else than numbers"),
         (format!("{RAW}space: mars\n"), "`mars` is not a space"),
-        (format!("{RAW}space: RAST\n"), "has four dimensions"),
+        (
+            format!("{RAW}space: RAST\nspace directions: (1,0,0) (0,1,0) (0,0,1)\n"),
+            "is not made of vectors",
+        ),
         (format!("{RAW}space directions: (1,0,0) (0,1,0)\n"), "has 2 vectors"),
         (format!("{RAW}space directions: (1,0) (0,1) (0,0)\n"), "is not made of vectors"),
         (format!("{RAW}space directions: (1,0,0) (0,1,0) (2,0,0)\n"), "would be flat"),
-        (format!("{RAW}space directions: (1,0,0) (0,1,0) none\n"), "no direction for axis 2"),
+        (
+            format!("{RAW}space directions: (1,0,0) (0,1,0) none\n"),
+            "the third axis of 3 x 2 x 1 is no axis of space: `none`",
+        ),
         (format!("{RAW}data file: LIST\n"), "names 0 files where the sizes want 1"),
         (format!("{RAW}data file: LIST 2 3\na b\n"), "`LIST 2 3` is not there"),
         (format!("{RAW}data file: LIST 4\na\n"), "ends in no number of axes"),

@@ -16,10 +16,13 @@ pub(crate) fn authority(address: &str) -> Result<String, ClientError> {
     let rest = rest.strip_prefix("http://").unwrap_or(rest);
     let rest = rest.strip_suffix('/').unwrap_or(rest);
     let default_port = DEFAULT_PORT.to_string();
-    let is_host_alone = rest.ends_with(']') || !rest.contains(':');
+    // A number alone is a port without a host.
+    let is_number = rest.bytes().all(|c| c.is_ascii_digit());
+    let is_host_alone = rest.ends_with(']') || !(rest.contains(':') || is_number);
     let (host, port) = match rest.rsplit_once(':') {
-        Some((host, port)) if !is_host_alone => (host, port),
-        _ => (rest, default_port.as_str()),
+        _ if is_host_alone => (rest, default_port.as_str()),
+        Some(host_and_port) => host_and_port,
+        None => return wrong("has no host; give host:port"),
     };
     if !matches!(port.parse::<u16>(), Ok(1..)) {
         return wrong("has no port that can be called; give host:port with 1 to 65535");
@@ -54,6 +57,7 @@ mod tests {
         }
         for written in [
             "",
+            "7433",
             "localhost:",
             "localhost:0",
             "localhost:99999",

@@ -158,10 +158,13 @@ fn host_port(text: &str, any_port: bool) -> Result<String, String> {
         return Err(format!("{bad}, without a scheme"));
     }
     let default_port = DEFAULT_PORT.to_string();
-    let is_host_alone = text.ends_with(']') || !text.contains(':');
+    // A number alone is a port without a host.
+    let is_number = text.bytes().all(|c| c.is_ascii_digit());
+    let is_host_alone = text.ends_with(']') || !(text.contains(':') || is_number);
     let (host, port) = match text.rsplit_once(':') {
-        Some((host, port)) if !is_host_alone => (host, port),
-        _ => (text, default_port.as_str()),
+        _ if is_host_alone => (text, default_port.as_str()),
+        Some(host_and_port) => host_and_port,
+        None => return Err(bad.into()),
     };
     let bare_v6 = host.contains(':') && !(host.starts_with('[') && host.ends_with(']'));
     if bare_v6 {
@@ -576,7 +579,9 @@ mod tests {
         assert_eq!(master("node7").as_deref(), Ok("node7:7433"));
         assert_eq!(master("[::1]").as_deref(), Ok("[::1]:7433"));
         assert!(listen("localhost:0").is_ok() && master("localhost:0").is_err());
-        for bad in ["", "::1", "host:", ":7433", "host:70000", "::1:7433", "http://a:1", "a b:1"] {
+        for bad in
+            ["", "::1", "7433", "host:", ":7433", "host:70000", "::1:7433", "http://a:1", "a b:1"]
+        {
             assert!(master(bad).is_err(), "{bad}");
         }
     }

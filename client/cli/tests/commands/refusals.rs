@@ -606,7 +606,7 @@ fn bad_environment_variable_is_refused_like_its_flag() {
     let out = slabcast(dir.path(), &args).env("SLABCAST_LISTEN", "0.0.0.0:1").output().unwrap();
     assert_eq!(out.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&out.stderr).contains("--insecure"));
-    let out = slabcast(dir.path(), &["render"]).env("SLABCAST_MASTER", "x").output().unwrap();
+    let out = slabcast(dir.path(), &["render"]).env("SLABCAST_MASTER", "x:").output().unwrap();
     assert_eq!(out.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&out.stderr).contains("SLABCAST_MASTER"));
 }

@@ -11,6 +11,7 @@ mod processes;
 use processes::{Process, SLABCAST};
 use slabcast_client::Client;
 use slabcast_common::stats::FrameStats;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -32,6 +33,17 @@ const VIEWS: [&str; 10] = [
 
 fn master() -> (Process, String) {
     processes::master(Path::new("."), VOLUME, &[])
+}
+
+/// Starts a master of `volume` at an address that was free a moment ago.
+fn master_at(address: &str, volume: &str) -> Process {
+    let child = Command::new(SLABCAST)
+        .args(["master", "--volume", volume, "--listen", address])
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("the master starts");
+    Process(child)
 }
 
 fn worker(master: &str, name: &str) -> Process {
@@ -276,18 +288,29 @@ async fn workers_reconnect_after_a_master_restart() {
     first.signal("-TERM");
     let mut first = first;
     assert_eq!(first.exit_within(Duration::from_secs(10)), Some(0), "a clean goodbye");
-    let again = Command::new(SLABCAST)
-        .args(["master", "--volume", VOLUME, "--listen", &address])
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    let _again = Process(again);
+    let _again = master_at(&address, VOLUME);
     let client = until("the master", async || Client::connect(&address).await.ok()).await;
     until("the worker again", async || {
         client.workers().await.ok()?.iter().find(|w| w.name == "patient").map(|_| ())
     })
     .await;
+}
+
+/// The client submits its job anew to a master that was restarted, and must not mix two volumes.
+#[tokio::test]
+async fn master_that_comes_back_with_another_volume_ends_the_job_with_an_error() {
+    let dir = tempfile::tempdir().unwrap();
+    let (first, address) = master();
+    let client = Client::connect(&address).await.unwrap();
+    let (mut rendering, _) = render(dir.path(), &address, "out", "auto");
+    until("the job", async || client.jobs(1).await.ok()?.pop()).await;
+    first.signal("-KILL");
+    drop(first);
+    let _other = master_at(&address, "formula:spheres:32");
+    assert_eq!(rendering.exit_within(Duration::from_secs(60)), Some(1));
+    let mut said = String::new();
+    rendering.0.stderr.take().expect("piped").read_to_string(&mut said).expect("text");
+    assert!(said.contains("serves another volume now: spheres"), "{said}");
 }
 
 /// A worker of another version is told both versions and does not dial again.

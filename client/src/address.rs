@@ -5,6 +5,14 @@ use crate::ClientError;
 /// Port of a master where an address names none.
 pub const DEFAULT_PORT: u16 = 7433;
 
+/// Returns an address with [`DEFAULT_PORT`] where it is a host alone. A number alone is no host, since
+/// it is meant as a port.
+pub fn with_default_port(address: &str) -> String {
+    let is_number = address.bytes().all(|c| c.is_ascii_digit());
+    let is_host_alone = address.ends_with(']') || !(address.contains(':') || is_number);
+    if is_host_alone { format!("{address}:{DEFAULT_PORT}") } else { address.to_owned() }
+}
+
 /// Returns the `host:port` of an address that may begin with `http://` and may have no port.
 pub(crate) fn authority(address: &str) -> Result<String, ClientError> {
     let wrong =
@@ -15,14 +23,9 @@ pub(crate) fn authority(address: &str) -> Result<String, ClientError> {
     }
     let rest = rest.strip_prefix("http://").unwrap_or(rest);
     let rest = rest.strip_suffix('/').unwrap_or(rest);
-    let default_port = DEFAULT_PORT.to_string();
-    // A number alone is a port without a host.
-    let is_number = rest.bytes().all(|c| c.is_ascii_digit());
-    let is_host_alone = rest.ends_with(']') || !(rest.contains(':') || is_number);
-    let (host, port) = match rest.rsplit_once(':') {
-        _ if is_host_alone => (rest, default_port.as_str()),
-        Some(host_and_port) => host_and_port,
-        None => return wrong("has no host; give host:port"),
+    let rest = with_default_port(rest);
+    let Some((host, port)) = rest.rsplit_once(':') else {
+        return wrong("has no host; give host:port");
     };
     if !matches!(port.parse::<u16>(), Ok(1..)) {
         return wrong("has no port that can be called; give host:port with 1 to 65535");
@@ -36,7 +39,7 @@ pub(crate) fn authority(address: &str) -> Result<String, ClientError> {
     if !ok {
         return wrong("is not host:port; write IPv6 as [::1]:port");
     }
-    Ok(format!("{host}:{port}"))
+    Ok(rest)
 }
 
 #[cfg(test)]

@@ -30,7 +30,7 @@ mod address;
 mod error;
 mod frames;
 
-pub use address::DEFAULT_PORT;
+pub use address::{DEFAULT_PORT, with_default_port};
 pub use error::ClientError;
 pub use frames::{FrameStream, PATIENCE, ReceivedFrame, Update};
 pub use slabcast_proto::convert::local_field;
@@ -64,8 +64,8 @@ const MAX_PAGE: usize = 1000;
 /// Wait before a call is made a second time.
 const AGAIN: Duration = Duration::from_millis(100);
 
-/// Times that a call is made whose request or response was damaged on its way. A line that damages
-/// half of all messages damages so many in a row once in a million.
+/// Most attempts at a call whose request or response arrives damaged. On a line that damages half of
+/// all attempts, one call in a million fails.
 const MOST_DAMAGED: u32 = 20;
 
 /// Longest such wait, whatever the master asks for.
@@ -126,7 +126,10 @@ impl Client {
         Ok(client)
     }
 
-    /// Asks whether a master is there. A connection alone says little: a web server takes it as well.
+    /// Checks that the peer is a master. A connection alone proves little: a web server accepts one too.
+    ///
+    /// # Errors
+    /// [`ClientError::NotAMaster`] if the peer is silent for [`CONNECT`] or answers otherwise.
     async fn greet(&self) -> Result<(), ClientError> {
         let mut render = self.render.clone();
         let question = render.describe_volume(wire::DescribeVolumeRequest {});

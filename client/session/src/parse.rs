@@ -1,6 +1,6 @@
 //! Values of flags: from text to what is meant, or what to give instead.
 
-use slabcast_client::DEFAULT_PORT;
+use slabcast_client::with_default_port;
 use slabcast_common::image::Background;
 use slabcast_common::shade::Light;
 use slabcast_common::transfer::NanColour;
@@ -157,15 +157,8 @@ fn host_port(text: &str, any_port: bool) -> Result<String, String> {
     if text.contains("://") {
         return Err(format!("{bad}, without a scheme"));
     }
-    let default_port = DEFAULT_PORT.to_string();
-    // A number alone is a port without a host.
-    let is_number = text.bytes().all(|c| c.is_ascii_digit());
-    let is_host_alone = text.ends_with(']') || !(text.contains(':') || is_number);
-    let (host, port) = match text.rsplit_once(':') {
-        _ if is_host_alone => (text, default_port.as_str()),
-        Some(host_and_port) => host_and_port,
-        None => return Err(bad.into()),
-    };
+    let text = with_default_port(text);
+    let (host, port) = text.rsplit_once(':').ok_or(bad)?;
     let bare_v6 = host.contains(':') && !(host.starts_with('[') && host.ends_with(']'));
     if bare_v6 {
         return Err("write an IPv6 address in brackets, like [::1]:7433".into());
@@ -173,7 +166,7 @@ fn host_port(text: &str, any_port: bool) -> Result<String, String> {
     let sane = |c: char| c.is_ascii_alphanumeric() || ".-_[]:%".contains(c);
     match port.parse::<u16>() {
         Ok(port) if !host.is_empty() && host.chars().all(sane) && (any_port || port > 0) => {
-            Ok(format!("{host}:{port}"))
+            Ok(text)
         }
         _ => Err(bad.into()),
     }

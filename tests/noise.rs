@@ -233,8 +233,8 @@ async fn swallowed(swallows: Swallows, beside_another: bool) -> (Duration, usize
     (before.elapsed(), proxy.connections.load(Relaxed).div_ceil(2))
 }
 
-/// Calls that only ask, beside each job of [`watched`]: so that requests are damaged, too, of which
-/// a job alone needs two.
+/// GetJob calls beside each job of [`watched`]. A job alone makes two requests, so few of the flips
+/// towards the master would hit one.
 const ASKED: usize = 20;
 
 /// Submits and watches jobs through a proxy that flips bits of what a client and its master send to

@@ -27,7 +27,7 @@ pub enum ClientError {
         /// Text of the system's error.
         cause: String,
     },
-    /// Something answers at the address, or holds its port, that is no master.
+    /// The peer at the address is no slabcast master, or says nothing.
     #[error(
         "no slabcast master at {address} ({problem}): check host and port; a master says at its start \
          where it listens, and no HTTP proxy may stand between"

@@ -34,8 +34,8 @@ const MAX_TRACE_BYTES: usize = 256 << 20;
 /// damages half of all frames damages so many in a row once in a million.
 const MOST_DAMAGED: u32 = 20;
 
-/// Time without a message after which a watch is begun anew. A master repeats its latest notice
-/// every 10 s. A chunk of 1 MiB takes as long at 280 kb/s.
+/// Longest silence of a watch before the client begins it anew. Masters repeat their latest notice
+/// every 10 s, and a chunk of 1 MiB takes 30 s at 280 kb/s.
 const STALLED: Duration = Duration::from_secs(30);
 
 /// Whether a stream ended since a message was damaged: DATA_LOSS, or INTERNAL from a message that
@@ -105,8 +105,8 @@ pub struct FrameStream {
 struct Open {
     chunks: Streaming<wire::WatchFramesResponse>,
     since: Instant,
-    /// Since when the next message is waited for. Kept here, since [`FrameStream::next`] may be
-    /// dropped and called again.
+    /// Time at which the wait for the next message began; `None` if none is waited for. A field, since
+    /// [`FrameStream::next`] may be dropped and called again.
     waiting_since: Option<Instant>,
 }
 

@@ -21,8 +21,8 @@ pub const BRICK_BATCHES_IN_FLIGHT: usize = 8;
 /// bytes a pixel.
 pub const FRAMES_IN_FLIGHT: usize = 4;
 
-/// Limit: frames in flight of all clients together. A client that has none in flight begins one beside
-/// [`FRAMES_IN_FLIGHT`] of others, up to this.
+/// Limit: frames in flight of all clients together. Beside [`FRAMES_IN_FLIGHT`] frames of others, a
+/// client without a frame in flight may begin one, up to this number.
 pub const MOST_FRAMES_IN_FLIGHT: usize = 8;
 
 /// Threads of a master that hash and encode frames, one frame at a time each. A frame of 512x512

@@ -160,9 +160,9 @@ pub enum ToWorker {
         /// Whether finished pixels travel uncompressed, because packing would take longer than it
         /// saves.
         plain: bool,
-        /// Whose frame it is: a number of the client. Workers share their threads out evenly among
-        /// the clients whose tasks they have.
-        share: u64,
+        /// Number of the client that asked for the frame. Workers divide the time of their threads
+        /// evenly among the clients whose tasks they have.
+        client: u64,
     },
     /// Part of a set's directory: bricks that exist, ascending by id. Parts come in order, before
     /// the set's first region. A worker keeps the [`DIRECTORIES_KEPT`] directories that came last.

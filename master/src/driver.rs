@@ -93,16 +93,16 @@ struct Flight {
     store: Arc<BrickStore>,
     /// Whether a watcher waited for it when it began.
     wanted: bool,
-    /// Number of the address that its job came from.
-    share: u64,
-    /// Whether it takes memory of the reserve for addresses that have no other frame in flight.
+    /// Number of the client (address) that submitted the job.
+    client: u64,
+    /// Whether the frame is made in the reserve for addresses without another frame in flight.
     in_reserve: bool,
-    /// Whether it is drawn under the `slab` schedule.
+    /// Whether the frame is drawn by the `slab` schedule.
     is_slab: bool,
     /// Bytes that it takes while it is made, and when it is finished.
     making_bytes: u64,
     finished_bytes: u64,
-    /// Microseconds of render threads that it took, once it is drawn.
+    /// Thread time of the frame in microseconds; `None` until it is drawn.
     took_us: Option<Micros>,
     /// Spans of the log that its lines belong to.
     frame_span: tracing::Span,
@@ -120,7 +120,7 @@ pub(crate) struct Driver {
     rehearse: bool,
     /// A frame that waits for memory.
     blocked: Option<feed::Blocked>,
-    /// What each worker that refused a tile last said, and the job.
+    /// Last refusal of a tile by each worker: the job, and the text for its clients.
     refusals: BTreeMap<WorkerId, (JobId, String)>,
     /// When to look for frames that may begin although nothing happens.
     look_again_at: Option<Micros>,

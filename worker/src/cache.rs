@@ -155,8 +155,9 @@ impl BrickCache {
         Ok(())
     }
 
-    /// Adds a directory as the latest. Of those before, regions may still draw from the tables; these
-    /// stay, and are the ones that their bricks are put into if the master sends them again.
+    /// Adds a directory as the latest. Directories beyond [`DIRECTORIES_KEPT`] go, but for those that
+    /// regions still draw from. If the master sends a directory again that is here, the old one is
+    /// kept, so that its regions see new bricks.
     fn add_table(&mut self, set: BrickSetKey, table: BrickTable) {
         if let Some(i) = self.tables.iter().position(|(key, _)| *key == set) {
             let here = self.tables.remove(i).filter(|(_, here)| here.is_like(&table));

@@ -289,12 +289,12 @@ impl<'a> Session<'a> {
             ToWorker::Scene(spec) => {
                 self.scenes.insert(spec.id, Arc::new(SceneSlot::new(spec)));
             }
-            ToWorker::Frame { frame, scene, view, finish, plain, share } => {
+            ToWorker::Frame { frame, scene, view, finish, plain, client } => {
                 if let Some(scene) = self.scenes.get(&scene) {
                     // The depths of a view can be checked against its volume only.
                     match convert::check_view(&scene.spec.volume.lattice, &view) {
                         Ok(()) => {
-                            let slot = FrameSlot::new(scene.clone(), view, finish, plain, share);
+                            let slot = FrameSlot::new(scene.clone(), view, finish, plain, client);
                             self.frames.insert(frame, Arc::new(slot));
                         }
                         Err(e) => warn!(%frame, error = %e, "ignoring a wrong view of the master"),

@@ -87,8 +87,8 @@ pub async fn submit(
     Ok(Source { updates, cancel, framing })
 }
 
-/// Checks that a master serves the volume that the pictures are of, after the job was submitted: one
-/// that is started anew with another volume does not know the job. Cancels the job otherwise.
+/// Checks that a master serves the volume with digest `volume`, and cancels `job` if not. To be called
+/// after the job was submitted: a master that restarts with another volume later doesn't know the job.
 ///
 /// # Errors
 /// The master serves another volume, or doesn't answer.

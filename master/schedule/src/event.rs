@@ -26,9 +26,9 @@ pub struct FrameJob {
     /// Format to which workers finish the pixels of regions. `None`: results are sums of light and
     /// opacity. Results of the `slab` schedule always are.
     pub finish: Option<PixelEncoding>,
-    /// Whose frame it is: a number of the client. Frames of one client are drawn in their order;
-    /// those of several are drawn beside each other and share all threads.
-    pub share: u64,
+    /// Number of the client that asked for the frame. Frames of one client complete in order; frames
+    /// of different clients are drawn at the same time and share all threads.
+    pub client: u64,
 }
 
 /// Host and name of a worker. Ids are new with each link; links with the same host and name belong to
@@ -88,7 +88,7 @@ pub enum Event {
         /// The leaving worker.
         worker: WorkerId,
     },
-    /// A frame is requested. Frames of one client ([`FrameJob::share`]) complete in the order in
+    /// A frame is requested. Frames of one client ([`FrameJob::client`]) complete in the order in
     /// which they are queued. The `slab` schedule renders one frame at a time; the `region` schedule
     /// overlaps a client's frames of one brick set, and frames of several clients whatever their
     /// sets.

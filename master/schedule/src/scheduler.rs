@@ -43,7 +43,7 @@ pub struct Scheduler {
     ended: BTreeSet<SceneId>,
     /// Workers that were found to lie.
     shut_out: BTreeSet<WorkerId>,
-    /// Whether frames of several clients were in flight at the last look.
+    /// Whether frames of several clients were in flight when `dispatch_as` ran last.
     was_shared: bool,
 }
 
@@ -124,7 +124,7 @@ impl Scheduler {
                     let all = cluster.roster.get(worker).map_or(0, |w| w.threads);
                     let mut threads = BTreeMap::new();
                     for frame in &mut self.active {
-                        let threads = threads.entry(frame.share()).or_insert(all);
+                        let threads = threads.entry(frame.client()).or_insert(all);
                         frame.leaving(worker, *threads);
                         *threads = threads.saturating_sub(frame.core().leases(worker));
                     }
@@ -144,8 +144,6 @@ impl Scheduler {
             }
             Event::Result { worker, result } => {
                 cluster.roster.heard(worker, now);
-                // A vote that counted when its time was over may have left some, of another set.
-                cluster.newly_used.clear();
                 let from = cluster.roster.get(worker);
                 // Results of local workers cross no link.
                 if from.is_some_and(|w| !w.is_local) {
@@ -259,8 +257,8 @@ impl Scheduler {
         }
     }
 
-    /// Sends bricks to a worker, on the account of the first frame in flight that is drawn from the
-    /// set, or else of the first.
+    /// Sends bricks to a worker. The transfer counts for the first frame in flight that is drawn from
+    /// `set`, or else for the first frame in flight.
     fn after_bricks(
         &mut self,
         worker: WorkerId,
@@ -314,12 +312,12 @@ impl Scheduler {
         let Some(mut worker) = self.cluster.roster.remove(id) else { return };
         self.cluster.totals.lost_workers += 1;
         let mut was_drawing = false;
-        // Its threads went from one client's tasks to another's: any of them may have killed it.
+        // Its threads take turns with clients' tasks, so a task of any client may have killed it.
         let mut threads = BTreeMap::new();
         for frame in &mut self.active {
             let leases = frame.core().leases(id);
             let blame = blame && !worker.leaving;
-            let threads = threads.entry(frame.share()).or_insert(worker.threads);
+            let threads = threads.entry(frame.client()).or_insert(worker.threads);
             frame.lost(&mut self.cluster, id, &worker, blame, *threads, now);
             *threads = threads.saturating_sub(leases);
             was_drawing |= blame && leases > 0;
@@ -404,8 +402,8 @@ impl Scheduler {
     fn step_frames(&mut self, freed_worker: Option<WorkerId>, clock: &dyn Clock) -> bool {
         let mut ended = false;
         let mut freed_worker = freed_worker;
-        let mut share = self.active.front().map_or(0, Frame::share);
-        self.see_through(share, freed_worker);
+        let mut client = self.active.front().map_or(0, Frame::client);
+        self.dispatch_as(client, freed_worker);
         let mut i = 0;
         loop {
             if i == self.active.len() {
@@ -413,12 +411,12 @@ impl Scheduler {
                 self.begin_frame(next, clock);
                 // To the new frame all workers are new, and the one before is no longer the last.
                 if freed_worker.take().is_some() {
-                    self.see_through(share, None);
+                    self.dispatch_as(client, None);
                 }
             }
-            let of = self.active[i].share();
-            if std::mem::replace(&mut share, of) != of {
-                self.see_through(share, freed_worker);
+            let of = self.active[i].client();
+            if std::mem::replace(&mut client, of) != of {
+                self.dispatch_as(client, freed_worker);
             }
             let context = StepContext { freed_worker, ..self.context(i, false) };
             match self.active[i].step(&mut self.cluster, context, clock) {
@@ -436,9 +434,9 @@ impl Scheduler {
         }
         for i in 0..self.active.len() {
             if self.active[i].as_region().is_some() && !self.active[i].is_done() {
-                let of = self.active[i].share();
-                if std::mem::replace(&mut share, of) != of {
-                    self.see_through(share, freed_worker);
+                let of = self.active[i].client();
+                if std::mem::replace(&mut client, of) != of {
+                    self.dispatch_as(client, freed_worker);
                 }
                 let context = StepContext { freed_worker, ..self.context(i, true) };
                 self.active[i].step(&mut self.cluster, context, clock);
@@ -455,12 +453,12 @@ impl Scheduler {
         ended
     }
 
-    /// Returns the index of the first frame that is done and that no earlier one of its client
-    /// holds up.
+    /// Returns the index of the first frame that is done and has no earlier frame of the same client
+    /// in flight.
     fn next_done(&self) -> Option<usize> {
         let is_held_up = |i: usize| {
-            let share = self.active[i].share();
-            self.active.range(..i).any(|f| f.share() == share)
+            let client = self.active[i].client();
+            self.active.range(..i).any(|f| f.client() == client)
         };
         (0..self.active.len()).find(|&i| self.active[i].is_done() && !is_held_up(i))
     }
@@ -499,9 +497,9 @@ impl Scheduler {
         // But for the first of a set, a frame that began alone and ends beside others tells of
         // neither kind.
         let is_odd = others == sole && !self.cluster.active_set.is_first();
-        // Threads that other clients' frames had meanwhile make the times mean little.
-        let share = done.share();
-        let is_shared = self.active.iter().any(|f| f.share() != share);
+        // Times mean little if other clients' frames used the threads meanwhile.
+        let client = done.client();
+        let is_shared = self.active.iter().any(|f| f.client() != client);
         if done.as_region().is_none() || is_odd || is_shared {
             return;
         }
@@ -557,37 +555,37 @@ impl Scheduler {
 
     /// Whether frames of several clients are in flight.
     fn is_shared(&self) -> bool {
-        let mut shares = self.active.iter().map(Frame::share);
-        shares.next().is_some_and(|first| shares.any(|share| share != first))
+        let mut shares = self.active.iter().map(Frame::client);
+        shares.next().is_some_and(|first| shares.any(|client| client != first))
     }
 
-    /// Looks at the workers as the frames of one client do: what they were lent of others' frames
-    /// does not count. Each client's frames are lent out as if they were alone, and workers share
-    /// their threads out among the clients; else a client whose tiles take minutes would fill all
+    /// Prepares to dispatch frames of one client: leases of other clients' frames don't count as load
+    /// of a worker. Each client's frames are lent out as if they were alone, and workers divide the
+    /// time of their threads among clients. Otherwise a client whose tiles take minutes would fill all
     /// workers.
-    fn see_through(&mut self, share: u64, freed_worker: Option<WorkerId>) {
+    fn dispatch_as(&mut self, client: u64, freed_worker: Option<WorkerId>) {
         let is_shared = self.is_shared();
         if is_shared || std::mem::replace(&mut self.was_shared, is_shared) {
-            let others: Vec<&Frame> = self.active.iter().filter(|f| f.share() != share).collect();
+            let others: Vec<&Frame> = self.active.iter().filter(|f| f.client() != client).collect();
             for (id, worker) in self.cluster.roster.iter_mut() {
                 let leases = others.iter().map(|f| u64::from(f.core().leases(id)));
                 worker.others_leases = leases.sum();
             }
         }
         self.was_shared = is_shared;
-        self.find_saturated(share, freed_worker);
+        self.find_saturated(client, freed_worker);
     }
 
-    /// Finds the workers that have enough to render of a client for a while, among all or just the
-    /// freed one.
-    fn find_saturated(&mut self, share: u64, freed_worker: Option<WorkerId>) {
+    /// Finds the workers that have enough work of a client for a while. Looks at the freed worker
+    /// alone, or at all if there is none.
+    fn find_saturated(&mut self, client: u64, freed_worker: Option<WorkerId>) {
         let cluster = &self.cluster;
         let roster = &cluster.roster;
         let queue_ahead = u64::from(cluster.config.queue_ahead.max(1));
         let costs = CostModel::new(&cluster.link_use, roster);
         let ahead = LendAhead::new(costs.lend_ahead_us(), roster);
         let is_enough = |id: WorkerId, w: &Worker| {
-            let own = self.active.iter().filter(|f| f.share() == share);
+            let own = self.active.iter().filter(|f| f.client() == client);
             let regions = own.filter_map(Frame::as_region);
             ahead.is_enough(w, regions.map(|f| f.lent_us(id)).sum(), queue_ahead)
         };
@@ -599,13 +597,12 @@ impl Scheduler {
         };
     }
 
-    /// Returns the index of the frame in the queue that begins next; `None`: none may. Frames of one
-    /// client begin in their order, and none passes one of the `slab` schedule, which would never
-    /// find all threads free else.
+    /// Returns the index of the next frame to begin; `None` if no frame may begin. Frames of one client
+    /// begin in order. No frame overtakes one of the `slab` schedule, which needs all threads free.
     fn next_to_begin(&self) -> Option<usize> {
         let mut seen = BTreeSet::new();
         for (i, job) in self.waiting.iter().enumerate() {
-            if !seen.insert(job.share) {
+            if !seen.insert(job.client) {
                 continue;
             }
             if self.may_begin(job) {
@@ -618,14 +615,14 @@ impl Scheduler {
         None
     }
 
-    /// Whether a client's next frame may begin beside those in flight: all are of the `region`
-    /// schedule, and the client has none there, or its own share their bricks with it and some thread
-    /// has nothing more of the client's to do.
+    /// Whether a client's next frame may begin beside those in flight. All must be of the `region`
+    /// schedule. If the client has frames in flight, they must have the same brick set, and some
+    /// thread must be out of the client's work.
     fn may_begin(&self, job: &FrameJob) -> bool {
         if self.active.is_empty() {
             return true;
         }
-        let own = self.active.iter().filter(|f| f.share() == job.share).count();
+        let own = self.active.iter().filter(|f| f.client() == job.client).count();
         let by_region = uses_regions(job) && self.active.iter().all(|f| f.as_region().is_some());
         if own == 0 || !by_region {
             return by_region && self.active.len() < MOST_FRAMES_IN_FLIGHT;
@@ -637,26 +634,27 @@ impl Scheduler {
         }
         let ahead = u64::from(self.cluster.config.queue_ahead.max(1));
         let others = |id| {
-            let others = self.active.iter().filter(|f| f.share() != job.share);
+            let others = self.active.iter().filter(|f| f.client() != job.client);
             others.map(|f| u64::from(f.core().leases(id))).sum::<u64>()
         };
         let mut active = self.cluster.roster.active();
         active.any(|(id, w)| w.leases - others(id) < u64::from(w.threads) * ahead)
     }
 
-    /// Whether a frame in the queue can overlap its client's frames in flight.
+    /// Whether a waiting frame can overlap its client's frames in flight: all are of the `region`
+    /// schedule and have one brick set.
     fn overlaps_own(&self, job: &FrameJob) -> bool {
         let overlaps =
             |f: &Frame| f.as_region().is_some_and(|f| f.core.job.scene.bricks == job.scene.bricks);
-        let mut own = self.active.iter().filter(|f| f.share() == job.share);
+        let mut own = self.active.iter().filter(|f| f.client() == job.client);
         uses_regions(job) && own.all(overlaps)
     }
 
     /// Returns what a step of the frame at an index may do.
     fn context(&self, i: usize, may_steal: bool) -> StepContext {
-        let share = self.active[i].share();
-        let is_last = !self.active.range(i + 1..).any(|f| f.share() == share);
-        let next = self.waiting.iter().find(|job| job.share == share);
+        let client = self.active[i].client();
+        let is_last = !self.active.range(i + 1..).any(|f| f.client() == client);
+        let next = self.waiting.iter().find(|job| job.client == client);
         let is_last_frame = is_last && !next.is_some_and(|job| self.overlaps_own(job));
         StepContext { may_steal, is_last_frame, freed_worker: None }
     }
@@ -723,8 +721,8 @@ impl Scheduler {
         self.cluster.roster.iter().map(view).collect()
     }
 
-    /// Returns the microseconds of render threads that a frame in flight took so far, by the results
-    /// that came; `None`: it is not in flight.
+    /// Returns the thread time of a frame in flight so far, in microseconds, from the results that
+    /// arrived; `None` if the frame is not in flight.
     pub fn rendered_us(&self, frame: FrameId) -> Option<Micros> {
         let frame = self.active.iter().find(|f| f.core().job.frame == frame)?;
         Some(frame.core().ledger.rendered_us())

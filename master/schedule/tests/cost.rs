@@ -68,7 +68,7 @@ fn cost(n: u32, edge: u32, height: f64, workers: u64, work: Work) -> f64 {
         view,
         work,
         finish: None,
-        share: 0,
+        client: 0,
     };
 
     let clock = Wall(Instant::now());

@@ -295,8 +295,8 @@ impl Observer for Audit {
             }
             Action::FrameDone { frame, .. } => {
                 self.note("done", frame.0, 0, now);
-                let share = self.jobs[frame].job.share;
-                let is_before = |j: &AuditedJob| j.job.share == share && !j.is_over;
+                let client = self.jobs[frame].job.client;
+                let is_before = |j: &AuditedJob| j.job.client == client && !j.is_over;
                 let first = self.jobs.iter().find(|(_, j)| is_before(j)).map(|(f, _)| *f);
                 assert!(first.is_none_or(|f| f >= *frame), "seed {seed}: {frame} before {first:?}");
                 let j = self.jobs.get_mut(frame).expect("a frame that was queued");

@@ -65,7 +65,7 @@ fn ball(frames: usize) -> (Vec<FrameJob>, Trace) {
             view,
             work: Work { schedule: Schedule::Region, ..Work::default() },
             finish: Some(finish),
-            share: 0,
+            client: 0,
         };
         let projected: Vec<_> = bricks.iter().map(|b| view.project(&b.tight)).collect();
         let rects: Vec<Rect> = projected.iter().flatten().map(|p| p.rect).collect();

@@ -59,7 +59,7 @@ fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
             let (schedule, borders) = (Schedule::Slab, Borders::Equal);
             let work = Work { schedule, borders, ..Work::default() };
             let (scene, bricks) = (scene.clone(), bricks.clone());
-            FrameJob { frame, number, scene, bricks, view, work, finish: None, share: 0 }
+            FrameJob { frame, number, scene, bricks, view, work, finish: None, client: 0 }
         })
         .collect();
     let frames = jobs.iter().map(|job| frame(job, &quality)).collect();

@@ -81,7 +81,7 @@ impl Driver {
         }
     }
 
-    /// Has a job's clients told that a worker refused a tile of it.
+    /// Tells the clients of a job that a worker refused a tile of it.
     pub(super) fn note_refusal(&mut self, id: WorkerId, lease: (TaskId, Epoch), reason: &str) {
         let Some((frame, tile)) = self.scheduler.leased(id, lease.0, lease.1) else { return };
         let Some(Flight { job, number, .. }) = self.flights.get(&frame) else { return };
@@ -100,7 +100,7 @@ impl Driver {
         self.jobs.ring_tile();
     }
 
-    /// Has the clients of a job told for how long the worker is asked nothing that refused a tile.
+    /// Tells the clients of a job how long the worker pauses that refused a tile of it.
     fn tell_pause(&mut self, id: WorkerId, pause_us: Micros) {
         let Some((job, refusal)) = self.refusals.get(&id) else { return };
         let said = format!("{refusal}; it is asked again in {:.2} s", pause_us as f64 / 1e6);

@@ -34,9 +34,9 @@ use tracing::{info, warn};
 /// all others. A frame of 1024x1024 takes 0.1 s.
 const HOLDS_BACK: Micros = 1_000_000;
 
-/// Divisor of the budget of flights: the reserve beside it. A sixteenth would not take a frame of
-/// 2048x2048 of a master that may hold 2 GiB; twice as much would be bounded by nothing that is asked
-/// for at start.
+/// The reserve is the budget of flights divided by this. With a sixteenth, a master of 2 GiB could not
+/// take a frame of 2048x2048. It comes on top of the memory that the master may hold, so it
+/// is no larger.
 const RESERVE_DIVISOR: u64 = 4;
 
 /// Microseconds after which the driver looks again while something waits for memory that time alone
@@ -48,7 +48,7 @@ const LOOKS_AGAIN: Micros = 200_000;
 pub(super) struct Room {
     /// Bytes of frames in the making, but for those in the reserve.
     making: u64,
-    /// Bytes of those in the reserve.
+    /// Bytes of frames in the making that are in the reserve.
     reserved: u64,
     /// Bytes that those which nobody waits for will have when they are finished.
     ahead: u64,
@@ -58,18 +58,19 @@ pub(super) struct Room {
     in_hand: u64,
 }
 
-/// Where a frame may begin.
+/// Budgets that have room for a frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Places {
-    /// In the budget of flights.
+    /// The budget of flights has room.
     main: bool,
-    /// In the reserve for addresses that have no frame in flight.
+    /// The reserve has room, and the address has no other frame in flight.
     reserve: bool,
 }
 
 impl Room {
-    /// Where a frame may begin that takes `making` bytes while it is made, and `finished` bytes then.
-    /// `is_only`: its address has no other in flight.
+    /// Returns the budgets that have room for a frame of `making` bytes while it is rendered and
+    /// `finished` bytes afterwards. `wanted`: a watcher waits for the frame. `is_only`: its address has
+    /// no other frame in flight.
     fn places(
         &self,
         shares: &Shares,
@@ -106,8 +107,8 @@ impl Driver {
         self.cut_next();
     }
 
-    /// Takes a frame out of those in flight, and charges its client with what it took. `None`: it is
-    /// not among them.
+    /// Removes a frame from those in flight and charges its client with the thread time it took.
+    /// Returns `None` if the frame is not in flight.
     pub(super) fn land(&mut self, frame: FrameId) -> Option<Flight> {
         let flight = self.flights.remove(&frame)?;
         let took_us = flight.took_us.or_else(|| self.scheduler.rendered_us(frame)).unwrap_or(0);
@@ -146,25 +147,25 @@ impl Driver {
         (making_bytes(&job.request), w * h * job.request.format.bytes() as u64)
     }
 
-    /// Where there is room for a frame.
+    /// Returns the budgets that have room for a candidate.
     fn places(&self, room: &Room, candidate: &Candidate) -> Places {
         let (making, finished) = self.bytes_of(candidate);
-        let share = self.active.share(candidate.job);
-        let is_only = self.flights.values().all(|f| f.share != share);
+        let client = self.active.client_of(candidate.job);
+        let is_only = self.flights.values().all(|f| f.client != client);
         room.places(&self.shares, (candidate.wanted, is_only), making, finished)
     }
 
     /// Whether a job of another address is in progress.
-    fn others_are_open(&self, share: u64) -> bool {
+    fn others_are_open(&self, client: u64) -> bool {
         let table = self.jobs.lock();
         let is_open = |id: &JobId| table.get(*id).is_some_and(|job| !job.view.state.is_over());
-        self.active.ids().any(|id| self.active.share(id) != share && is_open(&id))
+        self.active.ids().any(|id| self.active.client_of(id) != client && is_open(&id))
     }
 
-    /// Takes back a frame of the `slab` schedule, beside which no other can be drawn, when another
-    /// address has a job. It is drawn again under `region` ([`Driver::begin`]), to the same pixels.
+    /// Takes back frames of the `slab` schedule while another address has a job: no other frame can be
+    /// drawn beside them. They are drawn again by `region` ([`Driver::begin`]), to the same pixels.
     fn make_way(&mut self) {
-        let is_in_the_way = |f: &Flight| f.is_slab && self.others_are_open(f.share);
+        let is_in_the_way = |f: &Flight| f.is_slab && self.others_are_open(f.client);
         let flights = self.flights.iter().filter(|(_, f)| is_in_the_way(f));
         let frames: Vec<FrameId> = flights.map(|(frame, _)| *frame).collect();
         for frame in frames {
@@ -175,20 +176,20 @@ impl Driver {
         }
     }
 
-    /// Whether a frame may begin beside those in flight: there are fewer than [`FRAMES_IN_FLIGHT`] and
-    /// its address has none of another brick set, for which it would only wait; or the address has
-    /// none at all. So no address keeps others waiting by frames that take minutes.
+    /// Whether a frame may begin beside those in flight, so that no address keeps others waiting. An
+    /// address without a frame in flight may begin one while fewer than [`MOST_FRAMES_IN_FLIGHT`] fly.
+    /// Another needs fewer than [`FRAMES_IN_FLIGHT`], and all its frames must have one brick set.
     fn may_fly(&self, candidate: &Candidate) -> bool {
         let Some(job) = self.active.get(candidate.job) else { return false };
-        let share = self.active.share(candidate.job);
-        let mut own = self.flights.values().filter(|f| f.share == share).peekable();
+        let client = self.active.client_of(candidate.job);
+        let mut own = self.flights.values().filter(|f| f.client == client).peekable();
         if own.peek().is_none() {
             return self.flights.len() < MOST_FRAMES_IN_FLIGHT;
         }
         self.flights.len() < FRAMES_IN_FLIGHT && own.all(|f| f.scene.bricks == job.scene.bricks)
     }
 
-    /// The frame that begins next, and whether in the reserve.
+    /// Returns the frame to begin next, and whether it begins in the reserve.
     fn pick(&mut self) -> Option<(Candidate, bool)> {
         let now = self.clock.now();
         let room = self.room();
@@ -255,8 +256,8 @@ impl Driver {
         let kept = self.shares.frames.saturating_sub(making);
         self.jobs.lock().evict(kept as usize, None);
         self.last_frame_id += 1;
-        let share = self.active.share(id);
-        let others_are_open = self.others_are_open(share);
+        let client = self.active.client_of(id);
+        let others_are_open = self.others_are_open(client);
         let Some(job) = self.active.get(id) else { return false };
         let is_slab = job.request.work.schedule == Schedule::Slab && !others_are_open;
         let frame = FrameId(self.last_frame_id);
@@ -269,7 +270,7 @@ impl Driver {
             view,
             store: store.clone(),
             wanted,
-            share,
+            client,
             in_reserve,
             is_slab,
             making_bytes,
@@ -293,7 +294,7 @@ impl Driver {
             view,
             work,
             finish: (!job.request.want_hash).then(|| job.request.encoding()),
-            share,
+            client,
         };
         self.brick_sets.used(store.key());
         self.scheduler.handle(&self.clock, Happened::FrameQueued(Box::new(queued)));

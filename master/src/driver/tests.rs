@@ -62,15 +62,15 @@ fn join_unless(
     join_that(handle, pings, move |frame| if refuses(frame) { Does::Refuses } else { Does::Draws });
 }
 
-/// What a worker does with a tile.
+/// Reaction of a test worker to a tile.
 enum Does {
     Draws,
     Refuses,
-    /// Draws for ever.
+    /// Never answers.
     NeverEnds,
 }
 
-/// A worker as [`join`] has it, which does with tiles what `does` says for their frames.
+/// Links a worker as [`join`] does. `does` gives its reaction to tiles of a frame.
 fn join_that(
     handle: &Handle,
     pings: Arc<AtomicUsize>,
@@ -548,7 +548,14 @@ async fn addresses_share_the_work_whatever_the_number_of_their_jobs() {
     master.shutdown().await;
 }
 
-/// One address has as many frames in flight as it may, and none of them ever ends.
+/// Waits until a job is running.
+async fn running(handle: &Handle, job: JobId) {
+    while handle.job(job).expect("it is there").state != JobState::Running {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+}
+
+/// An address has the most frames in flight that it may have, and none of them ends.
 #[tokio::test]
 async fn frames_of_an_address_that_never_end_keep_no_other_address_waiting() {
     let master = master(Hooks::default(), 100_000);
@@ -567,9 +574,7 @@ async fn frames_of_an_address_that_never_end_keep_no_other_address_waiting() {
     let watching = handle.clone();
     let first = jobs[0];
     tokio::spawn(async move { watched(&watching, first).await });
-    while handle.job(first).expect("it is there").state != JobState::Running {
-        tokio::time::sleep(Duration::from_millis(1)).await;
-    }
+    running(&handle, first).await;
     for (key, preset) in [("x", "grey"), ("y", "peer-opaque"), ("z", "auto")] {
         let other = Some([10, 0, 0, 2].into());
         let job = handle.submit_from(request(key, 3, preset), other).await.expect("good");
@@ -583,8 +588,8 @@ async fn frames_of_an_address_that_never_end_keep_no_other_address_waiting() {
     master.shutdown().await;
 }
 
-/// Nothing can be drawn beside a frame of the `slab` schedule, and this one never ends: the worker
-/// draws regions alone.
+/// The worker draws regions alone, so a frame of the `slab` schedule would never end, and no other frame
+/// could begin.
 #[tokio::test]
 async fn frame_of_the_slab_schedule_makes_way_for_another_address_and_is_drawn_by_regions() {
     let master = master(Hooks::default(), 100_000);
@@ -595,9 +600,7 @@ async fn frame_of_the_slab_schedule_makes_way_for_another_address_and_is_drawn_b
         ..request("slab", 3, "grey")
     };
     let first = handle.submit_from(slab, Some([10, 0, 0, 1].into())).await.expect("good");
-    while handle.job(first).expect("it is there").state != JobState::Running {
-        tokio::time::sleep(Duration::from_millis(1)).await;
-    }
+    running(&handle, first).await;
     let other = Some([10, 0, 0, 2].into());
     let job = handle.submit_from(request("x", 100_000, "fog"), other).await.expect("good");
     let watching = handle.clone();
@@ -610,7 +613,7 @@ async fn frame_of_the_slab_schedule_makes_way_for_another_address_and_is_drawn_b
     master.shutdown().await;
 }
 
-/// A job whose only worker refuses all says so while it waits, and no longer once a tile is drawn.
+/// While its only worker refuses tiles, a job says that; once a tile is drawn it does not.
 #[tokio::test]
 async fn job_whose_worker_refuses_tiles_says_that_and_not_that_others_come_first() {
     let master = master(Hooks::default(), 100_000);

@@ -70,25 +70,25 @@ impl ActiveJob {
 pub(crate) struct ActiveJobs {
     by_id: BTreeMap<JobId, ActiveJob>,
     order: VecDeque<JobId>,
-    /// Addresses that jobs came from (`None`: this process). One that comes anew begins with the work
-    /// of the one that has least, so that it is served at once and has no claim on the past.
+    /// Addresses with jobs (`None`: this process). A new address starts with the least work of all
+    /// others: it is served at once, and can't claim the time before it came.
     peers: BTreeMap<Option<IpAddr>, Peer>,
     peer_of: BTreeMap<JobId, Option<IpAddr>>,
-    last_share: u64,
+    last_client: u64,
 }
 
 /// An address with jobs.
 #[derive(Clone, Copy, Debug)]
 struct Peer {
-    /// Its number for the scheduler and the workers.
-    share: u64,
-    /// Microseconds of render threads that its frames took, by measurement; of those that are not
-    /// done, by a guess from their size.
+    /// Number of the address for scheduler and workers (`FrameJob::client`).
+    client: u64,
+    /// Thread time of the address's frames in microseconds: measured for frames that ended, guessed
+    /// from their size for frames in flight.
     work_us: u64,
 }
 
-/// Returns the microseconds of render threads that a frame is taken for before it is done: one for
-/// each KiB that it takes while it is made. A small frame is work, too.
+/// Returns the guessed thread time of a frame in flight, in microseconds: 1 ms, and 1 us for each KiB
+/// of memory that it takes while it is rendered.
 fn guessed_us(making_bytes: u64) -> u64 {
     1000 + making_bytes / 1024
 }
@@ -97,8 +97,8 @@ impl ActiveJobs {
     pub(crate) fn insert(&mut self, id: JobId, job: ActiveJob, peer: Option<IpAddr>) {
         let least = self.peers.values().map(|peer| peer.work_us).min().unwrap_or(0);
         self.peers.entry(peer).or_insert_with(|| {
-            self.last_share += 1;
-            Peer { share: self.last_share, work_us: least }
+            self.last_client += 1;
+            Peer { client: self.last_client, work_us: least }
         });
         self.peer_of.insert(id, peer);
         self.by_id.insert(id, job);
@@ -127,7 +127,7 @@ impl ActiveJobs {
         self.by_id.contains_key(&id)
     }
 
-    /// Notes that a frame of a job was begun, which takes so many bytes while it is made.
+    /// Records that a frame of a job began, which takes `making_bytes` while it is rendered.
     pub(crate) fn begun(&mut self, id: JobId, making_bytes: u64) {
         if let Some(job) = self.by_id.get_mut(&id) {
             job.begun += 1;
@@ -138,8 +138,8 @@ impl ActiveJobs {
         }
     }
 
-    /// Notes that a frame ended, in whatever way, that was begun with so many bytes and took so many
-    /// microseconds of render threads.
+    /// Records that a frame ended, failed or was cancelled: replaces the guess for `making_bytes` by
+    /// its thread time `took_us`, in microseconds.
     pub(crate) fn ended(&mut self, id: JobId, making_bytes: u64, took_us: u64) {
         let peer = self.peer_of.get(&id).and_then(|peer| self.peers.get_mut(peer));
         if let Some(peer) = peer {
@@ -148,9 +148,9 @@ impl ActiveJobs {
         }
     }
 
-    /// Returns the number of the address that a job came from.
-    pub(crate) fn share(&self, id: JobId) -> u64 {
-        self.peer_of.get(&id).and_then(|peer| self.peers.get(peer)).map_or(0, |peer| peer.share)
+    /// Returns the number of the client (address) that submitted a job; 0 if the job is unknown.
+    pub(crate) fn client_of(&self, id: JobId) -> u64 {
+        self.peer_of.get(&id).and_then(|peer| self.peers.get(peer)).map_or(0, |peer| peer.client)
     }
 
     /// Ids, oldest first.

@@ -105,7 +105,7 @@ pub struct JobView {
     pub tiles: (u32, u32),
     /// Current slab, counted from 0, and number of slabs of the current frame.
     pub slab: (u32, u32),
-    /// Why it stands still, if its last news is that a worker refused a tile.
+    /// Text of the last refusal of a tile; `None` if a tile was drawn since.
     pub trouble: Option<String>,
     /// Number of workers that are linked to the master.
     pub workers: u32,
@@ -310,8 +310,8 @@ impl Table {
         self.has_place_among(open.map(|job| (job.held_bytes, job.peer)), bytes, peer)
     }
 
-    /// Checks the same beside `others`: bytes and address of each. Jobs of this process (`None`) have
-    /// no share of their own.
+    /// Checks that there is a place for a request of `bytes` from `peer` beside the requests `others`
+    /// (bytes and address of each). Requests of this process (`None`) may take all of the memory.
     fn has_place_among(
         &self,
         others: impl Iterator<Item = (usize, Option<IpAddr>)>,

@@ -145,11 +145,11 @@ struct NotedJob {
     finish: Option<PixelEncoding>,
     /// Number of the client; 0 where all frames are one client's.
     #[serde(default, skip_serializing_if = "is_nobody")]
-    share: u64,
+    client: u64,
 }
 
-fn is_nobody(share: &u64) -> bool {
-    *share == 0
+fn is_nobody(client: &u64) -> bool {
+    *client == 0
 }
 
 #[derive(Debug, Serialize, Deserialize)]

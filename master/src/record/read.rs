@@ -418,8 +418,8 @@ fn queued(job: NotedJob, seen: &mut Seen) -> Result<FrameJob, String> {
     convert::check_view(&scene.volume.lattice, &view).map_err(|e| format!("`view`: {e}"))?;
     job.work.check().map_err(|e| format!("`work`: {}: {}", e.field, e.problem))?;
     let (frame, number, work) = (FrameId(job.frame), job.number, job.work);
-    let NotedJob { finish, share, .. } = job;
-    Ok(FrameJob { frame, number, scene, bricks, view, work, finish, share })
+    let NotedJob { finish, client, .. } = job;
+    Ok(FrameJob { frame, number, scene, bricks, view, work, finish, client })
 }
 
 /// Returns blank finished pixels that the scheduler takes for the recorded ones.

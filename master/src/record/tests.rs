@@ -98,7 +98,7 @@ fn jobs(rng: &mut Rng, schedule: Schedule) -> Vec<FrameJob> {
             let (frame, number) = (FrameId(i as u64 + 1), i as u64);
             let (scene, bricks) = (scene.clone(), bricks.clone());
             let finish = finish(frame);
-            FrameJob { frame, number, scene, bricks, view, work, finish, share: 0 }
+            FrameJob { frame, number, scene, bricks, view, work, finish, client: 0 }
         })
         .collect()
 }

@@ -111,7 +111,7 @@ fn write(mut out: impl Write, entries: &Receiver<Entry>) -> std::io::Result<Reco
                     view: to_hex(&convert::view_to_wire(&job.view).encode_to_vec()),
                     work: job.work,
                     finish: job.finish,
-                    share: job.share,
+                    client: job.client,
                 };
                 written.events += 1;
                 put(&mut out, &Line::Event { t: differences(t), e: Noted::Queued(queued) })?;

@@ -33,8 +33,8 @@ const FULL_RETRY: Duration = Duration::from_secs(5);
 /// RetryInfo of a master that ends.
 const ENDING_RETRY: Duration = Duration::from_secs(1);
 
-/// Time without news of a job after which a watch gets its latest notice again: a client takes 30 s
-/// without a message for a connection that is stalled.
+/// Interval at which a watch without news repeats its latest notice. Clients take a silence of 30 s for
+/// a stalled connection.
 const HEARTBEAT: Duration = Duration::from_secs(10);
 
 /// The service.

@@ -91,7 +91,8 @@ pub(crate) fn read(
 }
 
 /// Reads the samples from files in the header's folder or below it; each holds an equal share.
-/// `field` is the header's name for them, `cap` the limit of all together, `notes` the header's.
+/// `field` is the header's name for the files, `cap` the limit of their bytes together; notes on
+/// padding go to `notes`.
 pub(crate) fn read_files(
     folder: &Path,
     (names, field): (&[String], &str),

@@ -84,7 +84,7 @@ pub(crate) struct Members<R: BufRead> {
 }
 
 impl<R: BufRead> Members<R> {
-    /// Decodes `inner`; padding that is ignored is told to `notes`.
+    /// Decodes `inner`. Adds a note on ignored padding to `notes`.
     pub(crate) fn new(packing: Packing, inner: R, notes: Notes) -> Self {
         Members { packing, decoder: Some(Decoder::new(packing, inner)), fresh: false, notes }
     }

@@ -510,7 +510,7 @@ fn origin(fields: &Fields) -> Result<Option<DVec3>, Problem> {
 #[derive(Clone, Copy)]
 struct Direction {
     xyz: DVec3,
-    /// Whether it leads into a dimension after the third.
+    /// Whether the vector has a component along a dimension after the third.
     more: bool,
 }
 

@@ -4,9 +4,8 @@
 //! The `tiff` crate decodes strips and tiles. This reader asks for one band of them at a time, so
 //! that no page is held whole, and checks that a band is no larger than the file can account for.
 //! TIFF has no field for the distance between pages: it comes from the description if ImageJ or OME
-//! wrote one. Resolutions alone are ignored, since picture programs fill in 72 dpi. Nor has it one
-//! for channels and times, which are pages too: the description tells them from slices, and the
-//! first is read.
+//! wrote one. Resolutions alone are ignored, since picture programs fill in 72 dpi. Channels
+//! and times are pages, too. The description tells them from slices, and the first of each is read.
 
 mod as_stored;
 mod description;

@@ -238,9 +238,9 @@ pub fn to_worker() -> impl Strategy<Value = ToWorker> {
         "\\PC{0,50}".prop_map(|reason| ToWorker::Refused { reason }),
         scene().prop_map(|s| ToWorker::Scene(Arc::new(s))),
         (any::<[u64; 3]>(), view(), prop::option::of(finish()), any::<bool>()).prop_map(
-            |([f, s, share], view, finish, plain)| {
+            |([f, s, client], view, finish, plain)| {
                 let (frame, scene) = (FrameId(f), SceneId(s));
-                ToWorker::Frame { frame, scene, view, finish, plain, share }
+                ToWorker::Frame { frame, scene, view, finish, plain, client }
             }
         ),
         lease().prop_map(|l| ToWorker::Lease(Box::new(l))),

@@ -55,7 +55,8 @@ pub(super) fn draw_slab(
     SlabReport { lease, received, ready, start, end, thread, outcome }
 }
 
-/// Draws a region as far as its bricks are here and its client's turn lasts. `give` is handed each piece that is split off.
+/// Draws a region until it ends, lacks bricks, or its client's turn ends. Calls `give` with each piece
+/// that is split off.
 pub(super) fn draw_region(
     thread: u32,
     simd: Simd,

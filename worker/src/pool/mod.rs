@@ -94,7 +94,7 @@ fn draw(thread: u32, simd: Simd, queue: &Queue, reports: &mpsc::UnboundedSender<
             // A region over which this fails will fail when it is drawn, and say so.
             report_prefetch(&frame, table, places.unwrap_or_default(), reports);
         }
-        let turn = Turn::new(queue, task.share());
+        let turn = Turn::new(queue, task.client());
         let report = match task {
             Task::Slab(task) => Report::Slab(draw_slab(thread, simd, task, &mut scratch)),
             Task::Region(task) => {
@@ -144,7 +144,7 @@ fn rehearse(
         // Either the task waited for the thread, or the thread for the task.
         let came = Instant::now();
         let begin = if came - asked < AT_ONCE { free } else { free.max(came) };
-        let turn = Turn::new(queue, task.share());
+        let turn = Turn::new(queue, task.client());
         for Prefetch { frame, table, tile } in prefetches {
             let places = rehearsal.expected(&frame, &table, tile);
             report_prefetch(&frame, table, places, reports);

@@ -15,29 +15,29 @@ use std::time::{Duration, Instant};
 /// then first come, first served.
 type Priority = (FrameId, bool, u64);
 
-/// Tuning (us): time that a thread draws a region while another client waits. At 5 ms a region of a
+/// Tuning (us): time slice: a region draws for so long before it gives way to a client that waits. At 5 ms a region of a
 /// frame of 1024x1024 takes 3 % longer beside another; at 100 ms a frame of 16 tiles takes 1.6 s
 /// beside one whose tiles take minutes.
 const SLICE: Duration = Duration::from_millis(20);
 
-/// Limit: clients whose time is remembered while none of their tasks is here.
-const SHARES_KEPT: usize = 64;
+/// Limit: clients without tasks whose time is remembered.
+const CLIENTS_KEPT: usize = 64;
 
-/// Tasks of one client, and the time that it had.
+/// Tasks and thread time of one client.
 #[derive(Default)]
-struct Share {
+struct Client {
     tasks: BTreeMap<Priority, Task>,
     spent: Duration,
-    /// Threads that draw a task of it.
+    /// Number of threads that draw a task of the client.
     running: u32,
 }
 
-impl Share {
+impl Client {
     fn is_here(&self) -> bool {
         self.running > 0 || !self.tasks.is_empty()
     }
 
-    /// Time that it had, and a slice for each thread that draws a task of it.
+    /// Returns the client's thread time, with one slice for each thread that draws a task of it now.
     fn charged(&self) -> Duration {
         self.spent + SLICE * self.running
     }
@@ -45,9 +45,9 @@ impl Share {
 
 #[derive(Default)]
 struct State {
-    /// By client. One that comes anew begins where the least of the others is: it is served at once
-    /// and has no claim on the past.
-    shares: BTreeMap<u64, Share>,
+    /// Clients by number. A new client starts with the least time of all others: it is served at once,
+    /// and can't claim the time before it came.
+    clients: BTreeMap<u64, Client>,
     last_number: u64,
     /// Regions in the queue whose bricks were not asked for in advance.
     unprefetched: usize,
@@ -68,29 +68,29 @@ struct State {
 }
 
 impl State {
-    /// Notes that a client has tasks from now on.
-    fn enter(&mut self, share: u64) {
-        if self.shares.get(&share).is_some_and(Share::is_here) {
+    /// Enters a client that is about to get tasks.
+    fn enter(&mut self, client: u64) {
+        if self.clients.get(&client).is_some_and(Client::is_here) {
             return;
         }
-        let here = self.shares.iter().filter(|(id, s)| **id != share && s.is_here());
+        let here = self.clients.iter().filter(|(id, s)| **id != client && s.is_here());
         let Some(least) = here.map(|(_, s)| s.charged()).min() else {
-            // It is alone, whatever others had.
-            self.shares.clear();
-            self.shares.insert(share, Share::default());
+            // No other client has tasks, so the time of all starts at zero.
+            self.clients.clear();
+            self.clients.insert(client, Client::default());
             return;
         };
-        self.shares.retain(|id, s| *id == share || s.is_here() || s.spent > least);
-        if self.shares.len() >= SHARES_KEPT {
-            self.shares.retain(|id, s| *id == share || s.is_here());
+        self.clients.retain(|id, s| *id == client || s.is_here() || s.spent > least);
+        if self.clients.len() >= CLIENTS_KEPT {
+            self.clients.retain(|id, s| *id == client || s.is_here());
         }
-        let entry = self.shares.entry(share).or_default();
+        let entry = self.clients.entry(client).or_default();
         entry.spent = entry.spent.max(least);
     }
 
-    /// Takes the next task: of the client that had least time, or of the older frame.
+    /// Takes the next task: of the client with the least time; between equals, of the older frame.
     fn take(&mut self) -> Option<Task> {
-        let waiting = self.shares.values_mut().filter(|s| !s.tasks.is_empty());
+        let waiting = self.clients.values_mut().filter(|s| !s.tasks.is_empty());
         let next = waiting.min_by_key(|s| (s.charged(), s.tasks.keys().next().copied()))?;
         let (_, task) = next.tasks.pop_first()?;
         next.running += 1;
@@ -143,14 +143,14 @@ impl Queue {
             Task::Slab(task) => (task.lease.frame, true),
             Task::Region(task) => (task.lease.frame, task.is_new()),
         };
-        let share = task.share();
+        let client = task.client();
         let mut state = locked(&self.state);
         let must_prefetch = matches!(&task, Task::Region(task) if !task.was_prefetched);
         state.unprefetched += usize::from(must_prefetch);
         state.last_number += 1;
         let priority = (frame, is_new, state.last_number);
-        state.enter(share);
-        state.shares.entry(share).or_default().tasks.insert(priority, task);
+        state.enter(client);
+        state.clients.entry(client).or_default().tasks.insert(priority, task);
         drop(state);
         self.bell.notify_one();
     }
@@ -166,7 +166,7 @@ impl Queue {
             let mut prefetches = Vec::new();
             if state.unprefetched > 0 {
                 state.unprefetched = 0;
-                for task in state.shares.values_mut().flat_map(|s| s.tasks.values_mut()) {
+                for task in state.clients.values_mut().flat_map(|s| s.tasks.values_mut()) {
                     let Task::Region(task) = task else { continue };
                     let is_done = std::mem::replace(&mut task.was_prefetched, true);
                     if !is_done && task.lease.begun.is_none() {
@@ -193,27 +193,28 @@ impl Queue {
     pub(super) fn close(&self) {
         let mut state = locked(&self.state);
         state.is_closed = true;
-        state.shares.clear();
+        state.clients.clear();
         drop(state);
         self.bell.notify_all();
     }
 
-    /// Counts time that a thread drew a client's region. Returns whether it is to give way to
-    /// another client, which had less time.
-    fn must_yield(&self, share: u64, time: Duration) -> bool {
+    /// Charges a client with `time` of a thread that draws a region. Returns whether a client with less
+    /// time waits, so that the region has to give way.
+    fn must_yield(&self, client: u64, time: Duration) -> bool {
         let mut state = locked(&self.state);
-        let Some(own) = state.shares.get_mut(&share) else { return false };
+        let Some(own) = state.clients.get_mut(&client) else { return false };
         own.spent += time;
         let spent = own.spent;
-        let mut others = state.shares.iter().filter(|(id, s)| **id != share && !s.tasks.is_empty());
+        let mut others =
+            state.clients.iter().filter(|(id, s)| **id != client && !s.tasks.is_empty());
         others.any(|(_, s)| s.charged() < spent)
     }
 
-    /// Counts the last time that a thread had a task of a client.
-    fn ran(&self, share: u64, time: Duration) {
-        if let Some(share) = locked(&self.state).shares.get_mut(&share) {
-            share.spent += time;
-            share.running = share.running.saturating_sub(1);
+    /// Charges a client with the last `time` of a thread that ended or paused a task.
+    fn ran(&self, client: u64, time: Duration) {
+        if let Some(client) = locked(&self.state).clients.get_mut(&client) {
+            client.spent += time;
+            client.running = client.running.saturating_sub(1);
         }
     }
 
@@ -232,36 +233,35 @@ impl Queue {
     }
 }
 
-/// The turn of a thread with one client's region: when it looks whether to give way, and whether it
-/// has to.
+/// Time slices of a thread that draws a region of one client.
 pub(super) struct Turn<'a> {
     queue: &'a Queue,
-    share: u64,
-    /// Time up to which its client was charged.
+    client: u64,
+    /// Time up to which the client is charged.
     charged_until: Cell<Instant>,
     is_over: Cell<bool>,
 }
 
 impl<'a> Turn<'a> {
-    pub(super) fn new(queue: &'a Queue, share: u64) -> Self {
+    pub(super) fn new(queue: &'a Queue, client: u64) -> Self {
         let (charged_until, is_over) = (Cell::new(Instant::now()), Cell::new(false));
-        Turn { queue, share, charged_until, is_over }
+        Turn { queue, client, charged_until, is_over }
     }
 
-    /// Whether the thread is to give way. Asked at each sheet; reads a clock, and locks the queue
-    /// once in a slice.
+    /// Whether the region has to give way to another client. Called at each sheet: reads a clock, and
+    /// locks the queue once a slice.
     pub(super) fn is_over(&self) -> bool {
         let now = Instant::now();
         let time = now - self.charged_until.get();
         if !self.is_over.get() && time >= SLICE {
             self.charged_until.set(now);
-            self.is_over.set(self.queue.must_yield(self.share, time));
+            self.is_over.set(self.queue.must_yield(self.client, time));
         }
         self.is_over.get()
     }
 
-    /// Ends the turn, and counts its time.
+    /// Ends the turn and charges the client.
     pub(super) fn end(self) {
-        self.queue.ran(self.share, self.charged_until.get().elapsed());
+        self.queue.ran(self.client, self.charged_until.get().elapsed());
     }
 }

@@ -44,8 +44,8 @@ pub(crate) struct FrameSlot {
     pub(crate) finish: Option<PixelEncoding>,
     /// Whether results are sent as they are, not packed (rehearsal only).
     pub(crate) plain: bool,
-    /// Whose frame it is: clients have equal shares of the threads.
-    pub(crate) share: u64,
+    /// Number of the client that asked for the frame. Clients get equal thread time.
+    pub(crate) client: u64,
     frame: OnceLock<Frame>,
     probe: OnceLock<ErrorProbe>,
     visible: OnceLock<VisibleBricks>,
@@ -67,7 +67,7 @@ impl FrameSlot {
         view: View,
         finish: Option<PixelEncoding>,
         plain: bool,
-        share: u64,
+        client: u64,
     ) -> Self {
         let (frame, probe, visible, depths, rehearsed, made, held, has_ended) = Default::default();
         FrameSlot {
@@ -75,7 +75,7 @@ impl FrameSlot {
             view,
             finish,
             plain,
-            share,
+            client,
             frame,
             probe,
             visible,

@@ -149,7 +149,7 @@ pub(crate) struct DrawnRegion {
 pub(crate) enum Progress {
     /// The frame had ended.
     FrameEnded,
-    /// To a sheet at which another client's turn came: it is drawn on when its own turn comes.
+    /// Drawn up to a sheet and paused there, since another client's turn came. It is in the queue again.
     GaveWay,
     /// To its end.
     Done(Box<DrawnRegion>),
@@ -179,11 +179,11 @@ pub(crate) enum Task {
 }
 
 impl Task {
-    /// Whose frame it is of.
-    pub(super) fn share(&self) -> u64 {
+    /// Returns the number of the client that asked for the task's frame.
+    pub(super) fn client(&self) -> u64 {
         match self {
-            Task::Slab(task) => task.frame.share,
-            Task::Region(task) => task.frame.share,
+            Task::Slab(task) => task.frame.client,
+            Task::Region(task) => task.frame.client,
         }
     }
 }

@@ -77,7 +77,7 @@ impl World {
         world.known = Some((spec.clone(), view));
         world.say(ToWorker::Scene(Arc::new(spec)));
         for (frame, finish) in [(FRAME, None), (FINISHED, Some(FINISH))] {
-            world.say(ToWorker::Frame { frame, scene: id, view, finish, plain: false, share: 0 });
+            world.say(ToWorker::Frame { frame, scene: id, view, finish, plain: false, client: 0 });
         }
         world
     }
@@ -249,7 +249,7 @@ async fn prefetch_requests_bricks_before_their_region_is_begun() {
     let spec = SceneSpec { id: SceneId(4), quality, ..known };
     let (scene, finish) = (spec.id, None);
     world.say(ToWorker::Scene(Arc::new(spec)));
-    world.say(ToWorker::Frame { frame, scene, view, finish, plain: false, share: 0 });
+    world.say(ToWorker::Frame { frame, scene, view, finish, plain: false, client: 0 });
     world.send(1).await;
     let tile = Rect::new(0, 0, 32, 32);
     world.region_of(frame, 1, tile);
@@ -290,7 +290,7 @@ async fn lookahead_grows_while_render_threads_wait_for_bricks() {
     let (scene, finish) = (spec.id, None);
     world.say(ToWorker::Scene(Arc::new(spec)));
     for frame in [FrameId(9), FrameId(10)] {
-        world.say(ToWorker::Frame { frame, scene, view, finish, plain: false, share: 0 });
+        world.say(ToWorker::Frame { frame, scene, view, finish, plain: false, client: 0 });
     }
     let bricks_of = |heard| match heard {
         ToMaster::BricksWanted { bricks, .. } => bricks.iter().map(|b| b.0).collect::<Vec<_>>(),
@@ -520,7 +520,7 @@ async fn long_region(world: &mut World) -> (FrameId, Rect, Box<TileResult>) {
         let spec = SceneSpec { id: SceneId(100 + n as u64), quality, ..known.clone() };
         let (frame, scene, finish) = (FrameId(100 + n as u64), spec.id, None);
         world.say(ToWorker::Scene(Arc::new(spec)));
-        world.say(ToWorker::Frame { frame, scene, view, finish, plain: false, share: 1 });
+        world.say(ToWorker::Frame { frame, scene, view, finish, plain: false, client: 1 });
         world.region_of(frame, 1, tile);
         let result = world.result().await;
         if result.times.end_us - result.times.start_us > 150_000 || n == 6 {

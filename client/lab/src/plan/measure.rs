@@ -89,8 +89,8 @@ pub(crate) fn jobs(scenes: &PathScenes, frames: usize, work: Work) -> Result<Vec
             let view = scenes.view(i, &scene.quality)?;
             let (frame, number) = (FrameId(i as u64 + 1), i as u64);
             let (scene, bricks) = (scene.clone(), bricks.clone());
-            let (finish, share) = (Some(FINISH), 0);
-            Ok(FrameJob { frame, number, scene, bricks, view, work, finish, share })
+            let (finish, client) = (Some(FINISH), 0);
+            Ok(FrameJob { frame, number, scene, bricks, view, work, finish, client })
         })
         .collect()
 }

@@ -117,9 +117,9 @@ impl FrameCore {
         if worker.scenes.insert(scene.id) {
             cluster.send(id, ToWorker::Scene(scene.clone()));
         }
-        let FrameJob { frame, view, share, .. } = *self.job;
+        let FrameJob { frame, view, client, .. } = *self.job;
         let (scene, finish) = (scene.id, self.finish);
-        cluster.send(id, ToWorker::Frame { frame, scene, view, finish, plain, share });
+        cluster.send(id, ToWorker::Frame { frame, scene, view, finish, plain, client });
     }
 
     /// Calls `send` for each new lease, in order, with the index of the lease among the worker's.

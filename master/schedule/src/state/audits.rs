@@ -10,11 +10,11 @@
 //! a result of an audited tile    is held, and the tile waits for another worker   (one vote)
 //! a second one                   equal: the tile is done; both have agreed
 //!                                not: a trusted worker's word counts, or a third decides
-//! nobody is there to compare     the tile is done, unaudited (nor is who has drawn nothing for 5 s)
+//! no other worker can compare    the tile is done, unaudited; stuck workers (5 s) don't count
 //! ```
 //!
-//! A tile that is audited is never split, so that votes are of one rectangle. Two votes of one
-//! worker count as one, whatever links they came by. The price is a tile
+//! A tile that is audited is never split, so that votes are of one rectangle. Each
+//! worker has one vote on a tile, also after it dialled again. The price is a tile
 //! drawn twice: sixteen for each new worker, a quarter of a frame, then one in a hundred.
 
 use crate::account::ledger::Rendered;

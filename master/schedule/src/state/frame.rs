@@ -302,7 +302,7 @@ impl FrameCore {
 
 impl Frame {
     /// Begins a frame. `lane`: the lane of workers that renders it, if not all do. `sole`: no other
-    /// frame is in flight or queued. Its brick set is open.
+    /// frame is in flight or queued. The brick set of `job` must be open in the residency.
     pub(crate) fn start(
         job: Box<FrameJob>,
         lane: Option<u32>,
@@ -321,9 +321,9 @@ impl Frame {
         frame
     }
 
-    /// Whose frame it is.
-    pub(crate) fn share(&self) -> u64 {
-        self.core().job.share
+    /// Returns the number of the client that asked for the frame ([`FrameJob::client`]).
+    pub(crate) fn client(&self) -> u64 {
+        self.core().job.client
     }
 
     pub(crate) fn core(&self) -> &FrameCore {

@@ -26,7 +26,7 @@ pub(crate) struct Reputation {
     pub(crate) strikes: u32,
     /// Whether any result of it was accepted.
     pub(crate) has_drawn: bool,
-    /// Audits in which it drew what others drew.
+    /// Number of audits in which the worker drew the same pixels as others.
     pub(crate) agreed: u32,
     seen: Micros,
 }

@@ -115,7 +115,8 @@ impl Task {
         self.blamed > 0
     }
 
-    /// Whether a worker's lease of it still runs; `None` if the worker has none.
+    /// Whether a worker's lease of the task is before its deadline; `None` if the worker has no lease
+    /// of the task.
     pub(crate) fn expects(&self, worker: WorkerId) -> Option<bool> {
         self.leases.iter().find(|l| l.worker == worker).map(|l| l.deadline.is_some())
     }
@@ -489,7 +490,7 @@ impl TaskQueue {
         self.tasks[place as usize].audit = Some(Audit::default());
     }
 
-    /// Forgets the votes of a worker that drew false pixels.
+    /// Removes the votes of a worker that drew false pixels from all tasks.
     pub(crate) fn forget_votes(&mut self, who: &WorkerIdentity) {
         let tasks = &mut self.tasks;
         self.held.retain(|p| tasks[*p as usize].audit.as_mut().is_some_and(|a| a.forget(who)));

@@ -38,8 +38,9 @@ const DRIFT: f64 = 100e-6;
 /// quarter of an hour; a worker that owes more will not answer the oldest.
 const MAX_PINGS: usize = 1024;
 
-/// Limit: time in microseconds with leases and without a result after which audits no longer wait for
-/// a worker. Tiles take milliseconds; a worker that answers pings alone would hold up frames.
+/// Limit: time in microseconds after which a worker that has leases and returns no result is stuck.
+/// Tiles take milliseconds. Without the limit, a worker that only answers pings would hold up every
+/// frame in which it could audit a tile.
 const STUCK_US: Micros = 5_000_000;
 
 /// Limit: lanes of workers that render overlapping frames in turn.
@@ -79,8 +80,8 @@ pub(crate) struct Worker {
     pub(crate) scenes: BTreeSet<SceneId>,
     /// Leases of frames in flight that it has not answered.
     pub(crate) leases: u64,
-    /// Those of them that other clients' frames have, as [`crate::Scheduler`] looks at it for the
-    /// frames of one client.
+    /// Leases of other clients' frames than the client whose frames are dispatched now
+    /// (`Scheduler::dispatch_as`).
     pub(crate) others_leases: u64,
     /// Ended frames that it is told about with the next message.
     pub(crate) over: Vec<FrameId>,
@@ -91,9 +92,10 @@ pub(crate) struct Worker {
     /// When it was pinged last, and since when it has leases.
     pinged: Micros,
     busy_since: Micros,
-    /// When its last result came.
+    /// Time at which the worker's last result arrived.
     answered: Micros,
-    /// Whether it had leases for [`STUCK_US`] and returned no result since: audits don't wait for it.
+    /// Whether the worker has had leases for [`STUCK_US`] without returning a result. Audits don't wait
+    /// for a stuck worker.
     pub(crate) is_stuck: bool,
     /// Whether the worker has leases and sent nothing for `Config::unresponsive_after`. It is lent nothing
     /// then, and other workers may be lent its tasks.
@@ -130,7 +132,7 @@ impl Worker {
         !self.leaving && !self.is_spare && !self.is_unresponsive && self.paused_until.is_none()
     }
 
-    /// Leases of the frames of the client that is looked at.
+    /// Returns the number of leases of the client whose frames are dispatched now.
     pub(crate) fn own_leases(&self) -> u64 {
         self.leases.saturating_sub(self.others_leases)
     }
@@ -363,14 +365,14 @@ impl Roster {
         self.idle -= usize::from(before && !w.has_idle_thread());
     }
 
-    /// Notes that a result of a worker came.
+    /// Records that a worker returned a result, at `now`.
     pub(crate) fn answered(&mut self, id: WorkerId, now: Micros) {
         let Some(w) = self.workers.get_mut(id) else { return };
         w.answered = now;
         w.is_stuck = false;
     }
 
-    /// Marks the workers that answer pings and draw nothing.
+    /// Marks workers as stuck that have had leases for [`STUCK_US`] without returning a result.
     pub(crate) fn mark_stuck(&mut self, now: Micros) {
         for (_, w) in self.workers.iter_mut().filter(|(_, w)| w.leases > 0) {
             w.is_stuck |= now >= w.busy_since.max(w.answered).saturating_add(STUCK_US);

@@ -48,7 +48,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             task,
             facts,
             set: job.scene.bricks,
-            share: job.share,
+            client: job.client,
             received: self.now_ns(),
             order: self.order,
             prefetched: false,
@@ -62,25 +62,25 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             drawn_ns: 0,
             pixels: 0,
         };
-        let share = job.share;
+        let client = job.client;
         let w = self.workers.get_mut(&id).expect("it is there");
         w.loans.push(loan);
         let least = w.spent.values().copied().min().unwrap_or(0);
-        w.spent.entry(share).or_insert(least);
+        w.spent.entry(client).or_insert(least);
         for thread in 0..w.running.len() {
-            self.cut_run(id, thread, share);
+            self.cut_run(id, thread, client);
         }
     }
 
     /// Lets a run give way to a client that waits, at the end of its slice.
-    fn cut_run(&mut self, id: WorkerId, thread: usize, share: u64) {
+    fn cut_run(&mut self, id: WorkerId, thread: usize, client: u64) {
         let now = self.now_ns();
         self.order += 1;
         let version = self.order;
         let w = self.workers.get_mut(&id).expect("it is there");
         let Some(run) = &mut w.running[thread] else { return };
         let is_region = matches!(run.loan.task, Task::Region(..));
-        if run.loan.share == share || !is_region || run.gives_way.is_some() {
+        if run.loan.client == client || !is_region || run.gives_way.is_some() {
             return;
         }
         let until = now.max(run.followed + SLICE);
@@ -111,7 +111,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             let ready = (0..w.loans.len()).filter(|&i| is_ready(&w.loans[i]));
             let next = ready.min_by_key(|&i| {
                 let l = &w.loans[i];
-                (w.spent.get(&l.share), l.task.frame(), !l.begun && l.stalls == 0, l.order)
+                (w.spent.get(&l.client), l.task.frame(), !l.begun && l.stalls == 0, l.order)
             })?;
             let mut loan = w.loans.remove(next);
             let (set, frame) = (loan.set, loan.task.frame());
@@ -200,7 +200,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
             loan.pixels = machine.run(now, ns);
         }
         self.order += 1;
-        let (version, share) = (self.order, loan.share);
+        let (version, client) = (self.order, loan.client);
         let (is_deadly, hangs) = (faults.deadly_tile == corner, faults.hanging_tile == corner);
         w.running[thread] = Some(Run {
             loan,
@@ -220,7 +220,8 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         } else if !hangs {
             self.later(end, Occurrence::RunEnd { worker: id, thread, version });
         }
-        if let Some(other) = self.workers[&id].loans.iter().map(|l| l.share).find(|s| *s != share) {
+        if let Some(other) = self.workers[&id].loans.iter().map(|l| l.client).find(|s| *s != client)
+        {
             self.cut_run(id, thread, other);
         }
     }
@@ -269,7 +270,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         let now = self.now_ns();
         let w = self.workers.get_mut(&id).expect("it is there");
         let mut run = w.running[thread].take().expect("a run that ends has begun");
-        *w.spent.entry(run.loan.share).or_default() += now - run.start;
+        *w.spent.entry(run.loan.client).or_default() += now - run.start;
         let gives_way = run.gives_way.is_some_and(|until| until <= now);
         if gives_way {
             run.follow(&w.present[&run.loan.set], now);

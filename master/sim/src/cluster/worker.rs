@@ -53,8 +53,8 @@ pub(super) struct Loan<R> {
     pub(super) task: Task<R>,
     pub(super) facts: TaskFacts,
     pub(super) set: BrickSetKey,
-    /// Whose frame it is of.
-    pub(super) share: u64,
+    /// Number of the client that asked for the frame.
+    pub(super) client: u64,
     pub(super) received: Nanos,
     /// The order in which threads take tasks.
     pub(super) order: u64,
@@ -91,7 +91,7 @@ pub(super) struct Run<R> {
     pub(super) followed: Nanos,
     /// Time that messages took of its core.
     pub(super) stolen_ns: Nanos,
-    /// When it gives way to another client, if one waits.
+    /// Time at which the run gives way to another client; `None` if no client waits.
     pub(super) gives_way: Option<Nanos>,
     /// When it ends, not counting messages meanwhile; `None`: never by itself.
     pub(super) end: Option<Nanos>,
@@ -163,7 +163,7 @@ pub(super) struct Worker<R> {
     /// Frames that were announced and have not ended.
     pub(super) frames: BTreeSet<FrameId>,
     pub(super) loans: Vec<Loan<R>>,
-    /// Time that each client had of its threads.
+    /// Thread time that each client had, in microseconds.
     pub(super) spent: BTreeMap<u64, Nanos>,
     pub(super) running: Vec<Option<Run<R>>>,
     pub(super) idle: Vec<Idle>,

@@ -10,22 +10,22 @@ use slabcast_schedule::{FrameJob, Micros};
 use slabcast_sim::{Incident, Rng, WorkerProfile};
 
 /// A frame of a client, of a set of its own.
-fn job_of(share: u64, frame: u64, edge: u32, thickness: f64) -> Box<FrameJob> {
+fn job_of(client: u64, frame: u64, edge: u32, thickness: f64) -> Box<FrameJob> {
     let quality = Quality { thickness, ..Quality::before() };
-    let scene = pattern::scene(share, pattern::key(share as u8), DIMS, quality);
+    let scene = pattern::scene(client, pattern::key(client as u8), DIMS, quality);
     let work = Work { schedule: Schedule::Region, ..Work::default() };
     let mut job = pattern::job(&mut Rng::new(5), frame, &scene, &bricks(), [edge, edge], work);
-    (job.share, job.finish) = (share, None);
+    (job.client, job.finish) = (client, None);
     job
 }
 
 /// A frame whose tiles take minutes on a slow worker.
-fn costly(share: u64, frame: u64) -> Box<FrameJob> {
-    job_of(share, frame, 64, 0.25)
+fn costly(client: u64, frame: u64) -> Box<FrameJob> {
+    job_of(client, frame, 64, 0.25)
 }
 
-fn cheap(share: u64, frame: u64) -> Box<FrameJob> {
-    job_of(share, frame, 32, 4.0)
+fn cheap(client: u64, frame: u64) -> Box<FrameJob> {
+    job_of(client, frame, 32, 4.0)
 }
 
 /// A worker of one thread that takes 0.1 ms for a pixel and sheet.

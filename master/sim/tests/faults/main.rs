@@ -112,7 +112,7 @@ fn chaos_of(seed: u64, schedules: Schedules, clients: u64) -> World {
         };
         let size = [rng.between(1, 130) as u32, rng.between(1, 130) as u32];
         let mut job = pattern::job(&mut rng, frame, &scene, bricks, size, work);
-        job.share = frame % clients;
+        job.client = frame % clients;
         let when = rng.below(30_000);
         // In the order of their numbers.
         w.schedule(1_000 + 50_000 * frame + when, Incident::Queue(job));

@@ -99,7 +99,7 @@ pub(crate) fn job(
         view,
         work,
         finish,
-        share: 0,
+        client: 0,
     })
 }
 

@@ -166,8 +166,8 @@ pub fn to_worker_to_wire(message: &ToWorker, session: u64) -> Down {
             Message::Refused(wire::Refused { reason: reason_to_wire(reason) })
         }
         ToWorker::Scene(scene) => Message::Scene(scene_to_wire(scene)),
-        ToWorker::Frame { frame, scene, view, finish, plain, share } => Message::Frame(
-            scene::frame_to_wire((*frame, *scene), view, finish.as_ref(), *plain, *share),
+        ToWorker::Frame { frame, scene, view, finish, plain, client } => Message::Frame(
+            scene::frame_to_wire((*frame, *scene), view, finish.as_ref(), *plain, *client),
         ),
         ToWorker::Directory { set, grid, first, total, bricks } => {
             return Down::Parts(directory::to_wire(set, *grid, (*first, *total), bricks));

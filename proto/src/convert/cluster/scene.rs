@@ -115,7 +115,7 @@ pub(super) fn frame_to_wire(
     view: &View,
     encoding: Option<&PixelEncoding>,
     uncompressed: bool,
-    share: u64,
+    client: u64,
 ) -> wire::Frame {
     let compression =
         if uncompressed { wire::Compression::None } else { wire::Compression::Unspecified };
@@ -128,7 +128,7 @@ pub(super) fn frame_to_wire(
             background: Some(background_to_wire(encoding.background)),
         }),
         compression: compression as i32,
-        share,
+        client,
     }
 }
 
@@ -149,7 +149,7 @@ pub(super) fn frame_from_wire(frame: wire::Frame) -> Result<ToWorker, WireError>
             .transpose()?,
         // One that this version does not know is a wish that it can't fulfil: LZ4.
         plain: frame.compression == wire::Compression::None as i32,
-        share: frame.share,
+        client: frame.client,
     })
 }
 

@@ -1,4 +1,4 @@
-//! Second drawings of audited tiles: who makes them, and what happens where nobody does.
+//! Audited tiles that wait for a second worker: choice of that worker, and tiles that none can draw.
 
 use super::Frame;
 use crate::Clock;
@@ -8,8 +8,8 @@ use crate::state::workers::Worker;
 use slabcast_common::ids::WorkerId;
 
 impl Frame {
-    /// Has another worker draw a task whose result waits to be compared: a trusted one, or the one
-    /// with least to do.
+    /// Gives a task whose result waits to be compared to a second worker: a trusted one if there is
+    /// one, else the one with the fewest leases.
     pub(super) fn find_second(&mut self, cluster: &Cluster, place: u32) {
         let Some(region) = self.as_region_mut() else { return };
         let Some(audit) = region.core.table.queue.tasks[place as usize].audit() else { return };
@@ -22,8 +22,8 @@ impl Frame {
         }
     }
 
-    /// Takes results that wait to be compared and that no linked worker can compare. Gives up tiles of
-    /// which workers drew different pixels while no other came for long.
+    /// Accepts the only result of a tile, unaudited, if no linked worker can draw it a second time.
+    /// Gives a tile up if workers drew different pixels and no third came within 10 s.
     pub(super) fn take_uncompared(&mut self, cluster: &mut Cluster, clock: &dyn Clock) {
         let now = clock.now();
         let (slab, _) = self.slab();
@@ -49,6 +49,8 @@ impl Frame {
             } else if let Some(drawn) = core.table.queue.take_sole_vote(place) {
                 core.unaudited.insert(drawn.who.clone());
                 self.enter(cluster, place, drawn, clock);
+                // Prefetch goes by results of the worker that the event is about.
+                cluster.newly_used.clear();
             }
         }
     }

@@ -24,6 +24,7 @@ use slabcast_scene::path::{Orientation, Turntable, ViewPath};
 use slabcast_scene::request::PathRequest;
 use slabcast_scene::transfer::TransferChoice;
 use slabcast_worker::{BrickCache, Config, Link};
+use std::cell::RefCell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
@@ -248,19 +249,26 @@ async fn watched(seed: u64, flips: u64, one_in: u64) {
     world.dial("quiet", &world.address);
     let begin = Instant::now();
     let mut damaged = 0;
+    // What the client waits for, for the message of a hang.
+    let doing = RefCell::new(String::new());
+    let did = |what: String| *doing.borrow_mut() = format!("{what} at {:.1?}", begin.elapsed());
     while noise.iter().any(|n| n.left.load(Relaxed) > 0) {
         let request = world.request();
         let want = truths[(world.jobs as usize - 1) % 6].clone();
         let got = tokio::time::timeout(PATIENT, async {
+            did("began to connect".into());
             let client = Client::connect(&proxy.address).await.expect("it listens");
+            did("connected".into());
             let job = client.submit(&request).await.expect("a good request");
-            for _ in 0..ASKED {
+            for n in 0..ASKED {
+                did(format!("made {n} calls of GetJob"));
                 let asked = client.job(&job).await.expect("it was just submitted");
                 assert_eq!((&asked.job_id, &asked.client_key), (&job, &request.client_key));
             }
             let mut frames = client.follow(&job, 0, PATIENCE).await.expect("it is there");
             let mut got = Vec::new();
             while let Some(update) = frames.next().await.expect("a frame in the end") {
+                did(format!("frame {}, {:?}", frames.next_frame(), frames.damaged_messages()));
                 if let Update::Frame(frame) = update {
                     let hash: String =
                         Sha256::digest(&frame.bytes).iter().map(|b| format!("{b:02x}")).collect();
@@ -275,9 +283,11 @@ async fn watched(seed: u64, flips: u64, one_in: u64) {
             let handle = world.master.handle();
             let flips = noise.each_ref().map(|n| n.flips.load(Relaxed));
             panic!(
-                "seed {seed}: job {} hangs after {flips:?} flips and {damaged} damaged messages of \
-                 watches: {:?}, {:?}",
+                "seed {seed}: job {} hangs at {:.1?} after {flips:?} flips and {damaged} damaged \
+                 messages of watches; the client: {}; {:?}, {:?}",
                 world.jobs,
+                begin.elapsed(),
+                doing.borrow(),
                 handle.jobs().last(),
                 handle.workers().await,
             );

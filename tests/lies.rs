@@ -11,7 +11,7 @@ use slabcast_proto::cluster_v1::cluster_service_client::ClusterServiceClient;
 use slabcast_proto::{convert, sealed};
 use slabcast_render::Simd;
 use slabcast_scene::path::{Orientation, Turntable, ViewPath};
-use slabcast_scene::request::PathRequest;
+use slabcast_scene::request::{PathRequest, VolumeChoice};
 use slabcast_scene::transfer::TransferChoice;
 use slabcast_worker::{BrickCache, Config, Link};
 use std::time::Duration;
@@ -35,6 +35,7 @@ fn request() -> PathRequest {
     let turn = Turntable { frames: 3, elevation: 20.0, ..Turntable::default() };
     PathRequest {
         client_key: "lies".into(),
+        volume: VolumeChoice::Default,
         path: ViewPath::from_turntable([150, 110], turn),
         transfer: TransferChoice::Name("auto".into()),
         quality: Quality::default(),

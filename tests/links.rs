@@ -22,7 +22,7 @@ use slabcast_render::{Frame, Scene};
 use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_scene::path::{Orientation, ProjectionKind, Turntable, ViewPath};
 use slabcast_scene::presets;
-use slabcast_scene::request::PathRequest;
+use slabcast_scene::request::{PathRequest, VolumeChoice};
 use slabcast_scene::transfer::TransferChoice;
 use slabcast_scene::tween::Tween;
 use slabcast_volumes::BrickStore;
@@ -38,6 +38,7 @@ fn request(key: &str, projection: ProjectionKind, work: Work) -> PathRequest {
     let turn = Turntable { frames: 3, elevation: 20.0, projection, ..Turntable::default() };
     PathRequest {
         client_key: key.into(),
+        volume: VolumeChoice::Default,
         path: ViewPath::from_turntable([150, 110], turn),
         transfer: TransferChoice::Name("auto".into()),
         quality: Quality::before(),

@@ -21,7 +21,7 @@ use slabcast_proto::cluster_v1::cluster_service_client::ClusterServiceClient;
 use slabcast_proto::{convert, sealed};
 use slabcast_render::Simd;
 use slabcast_scene::path::{Orientation, Turntable, ViewPath};
-use slabcast_scene::request::PathRequest;
+use slabcast_scene::request::{PathRequest, VolumeChoice};
 use slabcast_scene::transfer::TransferChoice;
 use slabcast_worker::{BrickCache, Config, Link};
 use std::cell::RefCell;
@@ -69,6 +69,7 @@ impl World {
         let turn = Turntable { frames: 3, elevation: 20.0, ..Turntable::default() };
         PathRequest {
             client_key: format!("job {}", self.jobs),
+            volume: VolumeChoice::Default,
             path: ViewPath::from_turntable([150, 110], turn),
             transfer: TransferChoice::Name(name.into()),
             quality: Quality::before(),
@@ -282,6 +283,7 @@ async fn watched(seed: u64, flips: u64, one_in: u64) {
         let Ok(got) = got.await else {
             let handle = world.master.handle();
             let flips = noise.each_ref().map(|n| n.flips.load(Relaxed));
+            let workers = handle.workers().await;
             panic!(
                 "seed {seed}: job {} hangs at {:.1?} after {flips:?} flips and {damaged} damaged \
                  messages of watches; the client: {}; {:?}, {:?}",
@@ -289,7 +291,7 @@ async fn watched(seed: u64, flips: u64, one_in: u64) {
                 begin.elapsed(),
                 doing.borrow(),
                 handle.jobs().last(),
-                handle.workers().await,
+                workers,
             );
         };
         assert_eq!(got, want, "seed {seed}");

@@ -26,7 +26,7 @@ use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_common::stats::FrameStats;
 use slabcast_master::jobs::{MAX_JOBS, WatchItem};
 use slabcast_scene::path::{Orientation, Turntable, ViewPath};
-use slabcast_scene::request::PathRequest;
+use slabcast_scene::request::{PathRequest, VolumeChoice};
 use slabcast_scene::transfer::TransferChoice;
 use slabcast_session::embedded::{Cluster, WorkerGroup};
 use std::collections::{BTreeMap, VecDeque};
@@ -95,6 +95,7 @@ fn requests() -> Vec<PathRequest> {
         };
         PathRequest {
             client_key: String::new(),
+            volume: VolumeChoice::Default,
             path: ViewPath::from_turntable([edge, edge * 3 / 4], turn),
             transfer: TransferChoice::Name(transfer.into()),
             quality: if after { Quality::default() } else { Quality::before() },
@@ -400,7 +401,7 @@ async fn run_job<'a>(
         30..33 => {
             client.jobs(100).await?;
             client.workers().await?;
-            client.volume().await?;
+            client.volume(&VolumeChoice::Default).await?;
             take(world, &job, client.watch(&job.id, 0).await?, 0).await
         }
         _ => {

@@ -63,6 +63,19 @@ pub enum ClientError {
         /// The first frame that is not whole.
         next_frame: u64,
     },
+    /// The master stayed away during an upload.
+    #[error(
+        "gave up on the master at {address} after {:.1} s ({last}): put the volume again when it is \
+         back; it goes on where it was", after.as_secs_f64()
+    )]
+    UploadStopped {
+        /// The master's address.
+        address: String,
+        /// Time that was spent waiting for it.
+        after: Duration,
+        /// Text of the last attempt's error.
+        last: String,
+    },
     /// A field of the request is wrong.
     #[error("refused: {field}: {problem}")]
     InvalidField {
@@ -83,6 +96,14 @@ pub enum ClientError {
         bytes: usize,
         /// The most bytes that are taken.
         most: usize,
+    },
+    /// The master has no such volume, can't read it, or does not take it.
+    #[error("{message}")]
+    Volume {
+        /// What is wrong.
+        reason: Reason,
+        /// The master's message, for people, with the remedy.
+        message: String,
     },
     /// The master does not know the job.
     #[error("{message}: list the jobs it knows, or submit the path again (same pixels)")]
@@ -167,6 +188,9 @@ impl ClientError {
         if let Some((field, problem)) = &details.field {
             let (field, problem) = (one_line(field), one_line(problem));
             return ClientError::InvalidField { field, problem };
+        }
+        if let Some(reason) = details.reason.filter(|r| r.is_of_volume()) {
+            return ClientError::Volume { reason, message };
         }
         let remedy = match status.code() {
             Code::NotFound => return ClientError::NotFound { message },

@@ -29,12 +29,16 @@
 mod address;
 mod error;
 mod frames;
+mod volumes;
 
 pub use address::{DEFAULT_PORT, with_default_port};
 pub use error::ClientError;
 pub use frames::{FrameStream, PATIENCE, ReceivedFrame, Update};
 pub use slabcast_proto::convert::local_field;
-pub use slabcast_proto::model::{Job, JobNotice, JobState, VolumeDescription, Worker};
+pub use slabcast_proto::model::{
+    Job, JobNotice, JobState, VolumeDescription, VolumeEntry, VolumeHeader, VolumeList,
+    VolumeOrigin, Worker,
+};
 pub use slabcast_proto::status::Reason;
 
 use prost::Message;
@@ -132,7 +136,8 @@ impl Client {
     /// [`ClientError::NotAMaster`] if the peer is silent for [`CONNECT`] or answers otherwise.
     async fn greet(&self) -> Result<(), ClientError> {
         let mut render = self.render.clone();
-        let question = render.describe_volume(wire::DescribeVolumeRequest {});
+        let first = wire::ListJobsRequest { page_size: 1, page_token: String::new() };
+        let question = render.list_jobs(first);
         let problem = match tokio::time::timeout(CONNECT, question).await {
             Err(_) => format!("it says nothing for {} s", CONNECT.as_secs()),
             Ok(Ok(_)) => return Ok(()),
@@ -267,18 +272,6 @@ impl Client {
         let response =
             self.call(async |mut r, request| r.cancel_job(request).await, request).await?;
         self.read_job(response.job)
-    }
-
-    /// Returns the volume that the master serves.
-    ///
-    /// # Errors
-    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Protocol`] if it does
-    /// not talk like one.
-    pub async fn volume(&self) -> Result<VolumeDescription, ClientError> {
-        let request = wire::DescribeVolumeRequest {};
-        let volume =
-            self.call(async |mut r, request| r.describe_volume(request).await, request).await?;
-        convert::volume_from_wire(volume).map_err(|e| self.protocol_error(&e))
     }
 
     /// Returns the master's workers, in the order in which they joined.

@@ -10,7 +10,7 @@ use slabcast_proto::render_v1::render_service_server::{RenderService, RenderServ
 use slabcast_proto::status::Reason;
 use slabcast_proto::{convert, render_v1 as wire};
 use slabcast_scene::path::{Turntable, ViewPath};
-use slabcast_scene::request::PathRequest;
+use slabcast_scene::request::{PathRequest, VolumeChoice};
 use slabcast_scene::transfer::TransferChoice;
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -112,6 +112,27 @@ impl RenderService for Script {
         Ok(Response::new(wire::DescribeVolumeResponse::default()))
     }
 
+    async fn list_volumes(
+        &self,
+        _: Request<wire::ListVolumesRequest>,
+    ) -> Result<Response<wire::ListVolumesResponse>, Status> {
+        Ok(Response::new(wire::ListVolumesResponse::default()))
+    }
+
+    async fn put_volume(
+        &self,
+        _: Request<wire::PutVolumeRequest>,
+    ) -> Result<Response<wire::PutVolumeResponse>, Status> {
+        Err(Reason::UploadsRefused.status("this master takes no volumes", &[]))
+    }
+
+    async fn remove_volume(
+        &self,
+        _: Request<wire::RemoveVolumeRequest>,
+    ) -> Result<Response<wire::RemoveVolumeResponse>, Status> {
+        Err(Reason::VolumeNotFound.status("no volume `a` here", &[]))
+    }
+
     async fn list_workers(
         &self,
         _: Request<wire::ListWorkersRequest>,
@@ -134,6 +155,7 @@ fn job(id: &str, state: JobState) -> Job {
         format: PixelFormat::Rgb8,
         submitted_unix_ms: 1,
         finished_unix_ms: 0,
+        volume: None,
     }
 }
 
@@ -247,6 +269,7 @@ async fn frame(frames: &mut FrameStream) -> ReceivedFrame {
 fn request(key: &str) -> PathRequest {
     PathRequest {
         client_key: key.into(),
+        volume: VolumeChoice::Default,
         path: ViewPath::from_turntable([64, 64], Turntable::default()),
         transfer: TransferChoice::Name("auto".into()),
         quality: Quality::before(),
@@ -487,7 +510,7 @@ async fn status_details_become_typed_errors_with_a_remedy() {
         e.to_string(),
         "64 watchers are enough (ResourceExhausted): the master is full; try later, or cancel a job"
     );
-    let e = client.volume().await.unwrap_err();
+    let e = client.volume(&VolumeChoice::Default).await.unwrap_err();
     assert!(matches!(e, ClientError::Protocol { .. }), "{e}");
 }
 

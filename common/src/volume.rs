@@ -5,6 +5,7 @@ mod core;
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use std::borrow::Cow;
 
 /// Lattice of a volume's samples. World units are the file's (mm), world axes anatomical (RAS+)
 /// where the file has them (docs/design/contracts.md, World and camera).
@@ -210,6 +211,18 @@ impl Samples {
             Samples::U8(v) => to.iter_mut().zip(v).for_each(|(to, &s)| *to = s.into()),
             Samples::U16(v) => to.iter_mut().zip(v).for_each(|(to, &s)| *to = s.into()),
             Samples::F32(v) => to.iter_mut().zip(v).for_each(|(to, &s)| *to = s.to_bits()),
+        }
+    }
+
+    /// Returns the bytes of a range of samples, little-endian: what [`VolumeHasher`] takes.
+    ///
+    /// # Panics
+    /// If the range goes beyond the samples.
+    pub fn le_bytes(&self, range: std::ops::Range<usize>) -> Cow<'_, [u8]> {
+        match self {
+            Samples::U8(v) => Cow::Borrowed(&v[range]),
+            Samples::U16(v) => v[range].iter().flat_map(|x| x.to_le_bytes()).collect(),
+            Samples::F32(v) => v[range].iter().flat_map(|x| x.to_le_bytes()).collect(),
         }
     }
 
@@ -480,40 +493,12 @@ impl Volume {
     /// Returns the SHA-256 over lattice, value map and samples. Two volumes with one digest give
     /// the same pictures; the name is not part of it.
     pub fn digest(&self) -> Digest32 {
-        let mut h = Sha256::new();
-        h.update(b"slabcast volume 1");
-        for n in self.lattice.dims {
-            h.update(n.to_le_bytes());
+        let mut hasher = VolumeHasher::new(&self.lattice, self.summary.map, self.samples.kind());
+        let count = self.samples.len();
+        for begin in (0..count).step_by(1 << 15) {
+            hasher.update(&self.samples.le_bytes(begin..count.min(begin + (1 << 15))));
         }
-        let numbers = self
-            .lattice
-            .steps
-            .iter()
-            .flat_map(|s| s.to_array())
-            .chain(self.lattice.origin.to_array())
-            .chain([self.summary.map.scale, self.summary.map.offset]);
-        for x in numbers {
-            h.update(x.to_le_bytes());
-        }
-        match &self.samples {
-            Samples::U8(v) => {
-                h.update([1]);
-                h.update(v);
-            }
-            Samples::U16(v) => {
-                h.update([2]);
-                v.chunks(1 << 15).for_each(|c| {
-                    h.update(c.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<_>>())
-                });
-            }
-            Samples::F32(v) => {
-                h.update([3]);
-                v.chunks(1 << 14).for_each(|c| {
-                    h.update(c.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<_>>())
-                });
-            }
-        }
-        Digest32(h.finalize().into())
+        hasher.finish()
     }
 
     /// Returns the gradient of the raw field at sample (i, j, k) in world axes, in codes per vox:
@@ -561,6 +546,47 @@ impl Volume {
     }
 }
 
+/// Computes [`Volume::digest`] of samples that come in pieces.
+#[derive(Clone, Debug)]
+pub struct VolumeHasher(Sha256);
+
+impl VolumeHasher {
+    /// Starts the digest of a volume on `lattice` whose codes have type `kind` and stand for the values
+    /// that `map` gives.
+    pub fn new(lattice: &Lattice, map: ValueMap, kind: SampleKind) -> VolumeHasher {
+        let mut h = Sha256::new();
+        h.update(b"slabcast volume 1");
+        for n in lattice.dims {
+            h.update(n.to_le_bytes());
+        }
+        let numbers = lattice
+            .steps
+            .iter()
+            .flat_map(|s| s.to_array())
+            .chain(lattice.origin.to_array())
+            .chain([map.scale, map.offset]);
+        for x in numbers {
+            h.update(x.to_le_bytes());
+        }
+        h.update([match kind {
+            SampleKind::U8 => 1,
+            SampleKind::U16 => 2,
+            SampleKind::F32 => 3,
+        }]);
+        VolumeHasher(h)
+    }
+
+    /// Adds the bytes of the next samples, little-endian. A piece may end within a sample.
+    pub fn update(&mut self, bytes: &[u8]) {
+        self.0.update(bytes);
+    }
+
+    /// Returns the digest of all samples that were added.
+    pub fn finish(self) -> Digest32 {
+        Digest32(self.0.finalize().into())
+    }
+}
+
 /// A volume without its samples: what master, workers and clients share.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VolumeInfo {
@@ -575,6 +601,23 @@ pub struct VolumeInfo {
 /// A SHA-256 digest of 32 bytes, shown as 64 hexadecimal digits.
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Digest32(pub [u8; 32]);
+
+impl std::str::FromStr for Digest32 {
+    type Err = String;
+
+    /// Reads 64 hexadecimal digits.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let bad = || "a digest has 64 hexadecimal digits".to_string();
+        if text.len() != 64 || !text.is_ascii() {
+            return Err(bad());
+        }
+        let mut bytes = [0; 32];
+        for (byte, at) in bytes.iter_mut().zip((0..).step_by(2)) {
+            *byte = u8::from_str_radix(&text[at..at + 2], 16).map_err(|_| bad())?;
+        }
+        Ok(Digest32(bytes))
+    }
+}
 
 impl std::fmt::Display for Digest32 {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {

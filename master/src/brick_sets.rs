@@ -7,6 +7,7 @@
 //! two jobs would take each other's bricks away before either draws a frame.
 
 use slabcast_common::brick::BrickSetKey;
+use slabcast_common::volume::Digest32;
 use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_schedule::Micros;
 use slabcast_volumes::BrickStore;
@@ -41,9 +42,15 @@ impl BrickSets {
         BrickSets { sets: Vec::new(), budget_bytes, cutting: None }
     }
 
-    /// A set that covers `wanted`.
-    pub(crate) fn covering(&self, wanted: &BrickNeeds) -> Option<&Arc<BrickStore>> {
-        self.sets.iter().map(|held| &held.store).find(|s| s.needs().covers(wanted))
+    /// A set of the volume with digest `volume` that covers `wanted`.
+    pub(crate) fn covering(
+        &self,
+        volume: Digest32,
+        wanted: &BrickNeeds,
+    ) -> Option<&Arc<BrickStore>> {
+        let is_of_volume = |s: &BrickStore| s.key() == s.needs().set_key(volume);
+        let mut stores = self.sets.iter().map(|held| &held.store);
+        stores.find(|s| is_of_volume(s) && s.needs().covers(wanted))
     }
 
     /// The set with this key.

@@ -15,20 +15,18 @@ use crate::admission::{AttachError, WorkerTable};
 use crate::brick_sets::BrickSets;
 use crate::finish::Assembly;
 use crate::finishers::Finishers;
-use crate::handle::ServedVolume;
 use crate::hooks::Hooks;
 use crate::jobs::active::ActiveJobs;
 use crate::jobs::submit::{Plan, SubmitError};
 use crate::jobs::{FinishedFrame, JobState, Jobs};
+use crate::library::Library;
 use crate::link::{Caller, WorkerLink};
 use crate::memory::Shares;
-use crate::panics::Panicked;
 use crate::record::RecordedScheduler;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, JobId, WorkerId};
 use slabcast_common::message::{Hello, SceneSpec, TOLD_TO_STOP, ToMaster, ToWorker};
 use slabcast_common::view::View;
-use slabcast_common::volume::Volume;
 use slabcast_proto::model::Worker;
 use slabcast_schedule::{Clock, Event as Happened, Micros};
 use slabcast_volumes::BrickStore;
@@ -60,7 +58,7 @@ pub(crate) enum Event {
         reply: oneshot::Sender<Result<JobId, SubmitError>>,
     },
     /// A brick set was cut.
-    BricksCut { set: BrickSetKey, store: Result<Arc<BrickStore>, Panicked> },
+    BricksCut { set: BrickSetKey, store: Result<Arc<BrickStore>, String> },
     /// A watcher took a frame, so that there may be room for another, or waits for one.
     FrameTaken,
     /// A frame was finished.
@@ -113,8 +111,7 @@ struct Flight {
 
 /// See the head of the file.
 pub(crate) struct Driver {
-    volume: Arc<Volume>,
-    served: Arc<ServedVolume>,
+    library: Arc<Library>,
     shares: Shares,
     clock: RealClock,
     rehearse: bool,
@@ -140,7 +137,7 @@ pub(crate) struct Driver {
 
 impl Driver {
     pub(crate) fn new(
-        (volume, served): (Arc<Volume>, Arc<ServedVolume>),
+        library: Arc<Library>,
         shares: Shares,
         rehearse: bool,
         scheduler: RecordedScheduler,
@@ -150,8 +147,7 @@ impl Driver {
         hooks: Hooks,
     ) -> Driver {
         Driver {
-            volume,
-            served,
+            library,
             shares,
             clock: RealClock(Instant::now()),
             rehearse,

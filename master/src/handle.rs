@@ -6,6 +6,7 @@ use crate::finishers::Finishers;
 use crate::hooks::{Hooks, Stage};
 use crate::jobs::submit::{Plan, SubmitError, check_key};
 use crate::jobs::{JobView, Jobs, Watch};
+use crate::library::{Library, OpenVolume, Viewer};
 use crate::link::{Caller, WorkerLink};
 use crate::memory::Shares;
 use crate::panics::caught;
@@ -13,7 +14,7 @@ use crate::record::{RecordedScheduler, Recorder};
 use crate::serve::{PeerLimits, counted_as};
 use slabcast_common::ids::{JobId, WorkerId};
 use slabcast_common::message::{Hello, ToMaster};
-use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_common::volume::{Digest32, Volume};
 use slabcast_proto::model::Worker;
 use slabcast_scene::path::Orientation;
 use slabcast_scene::request::PathRequest;
@@ -29,17 +30,15 @@ const PLANS_AT_ONCE: usize = 2;
 /// Events that wait for the driver before whoever sends one has to wait.
 const INBOX: usize = 1024;
 
-/// Settings of a master: its volume, memory, scheduler and record.
+/// Settings of a master: its volumes, memory, scheduler and record.
 pub struct MasterConfig {
-    /// The volume that the master serves.
-    pub volume: Arc<Volume>,
-    /// Axes of the volume that are up and front.
-    pub orientation: Orientation,
+    /// The volumes that the master serves.
+    pub library: Library,
     /// Bytes that the master may hold, by what takes them.
     pub shares: Shares,
     /// Caps of jobs, watchers and connections of one client address.
     pub peer_limits: PeerLimits,
-    /// Whether clients of other machines are told the name of the volume's file.
+    /// Whether clients of other machines are told the names of volumes.
     pub show_names: bool,
     /// Settings of the scheduler that the master drives.
     pub schedule: slabcast_schedule::Config,
@@ -59,12 +58,16 @@ pub struct MasterConfig {
 }
 
 impl MasterConfig {
-    /// Returns the defaults for `volume`: the memory of a master that serves its own process, no
-    /// record, no rehearsal.
+    /// Returns the defaults for a master of one volume: the memory of a master that serves its own
+    /// process, no record, no rehearsal.
     pub fn new(volume: impl Into<Arc<Volume>>, orientation: Orientation) -> Self {
+        MasterConfig::of(Library::of(volume, orientation))
+    }
+
+    /// Returns the defaults, as [`MasterConfig::new`], for a master of these volumes.
+    pub fn of(library: Library) -> Self {
         MasterConfig {
-            volume: volume.into(),
-            orientation,
+            library,
             shares: Shares::default(),
             peer_limits: PeerLimits::default(),
             show_names: false,
@@ -77,21 +80,6 @@ impl MasterConfig {
             hooks: Hooks::default(),
         }
     }
-}
-
-/// Description of the volume that a master serves.
-#[derive(Clone, Debug)]
-pub struct ServedVolume {
-    /// Name of the volume's file, without folders.
-    pub name: String,
-    /// Number type of the samples in the file, as its format names it.
-    pub file_type: String,
-    /// Whether world axes are anatomical (left, posterior, superior).
-    pub anatomical: bool,
-    /// Lattice, range of values, histogram and digest.
-    pub info: VolumeInfo,
-    /// Axes of the volume that are up and front.
-    pub orientation: Orientation,
 }
 
 /// A running master. Dropped without [`Master::shutdown`], its driver goes on until the last
@@ -107,14 +95,7 @@ impl Master {
     /// # Errors
     /// If the system gives no thread.
     pub fn start(config: MasterConfig) -> std::io::Result<Master> {
-        let digest = config.volume.digest();
-        let served = Arc::new(ServedVolume {
-            name: config.volume.name.clone(),
-            file_type: config.volume.file_type.clone(),
-            anatomical: config.volume.anatomical,
-            info: config.volume.info(digest),
-            orientation: config.orientation,
-        });
+        let library = Arc::new(config.library);
         let (inbox, events) = mpsc::channel(INBOX);
         // Ids are never used again, not even by the next master at this address: a client that
         // takes up its watch must not see another's job. The clock may be set back, so chance
@@ -126,8 +107,7 @@ impl Master {
         let handle = Handle {
             inbox: inbox.clone(),
             jobs: jobs.clone(),
-            served: served.clone(),
-            volume: config.volume.clone(),
+            library: library.clone(),
             planning: Arc::new(Semaphore::new(PLANS_AT_ONCE)),
             shares: config.shares,
             peer_limits: config.peer_limits,
@@ -149,7 +129,7 @@ impl Master {
         schedule.audit_seed = getrandom::u64().map_err(std::io::Error::other)?;
         let scheduler = RecordedScheduler::new(schedule, config.record);
         let driver = Driver::new(
-            (config.volume, served),
+            library,
             config.shares,
             config.rehearse,
             scheduler,
@@ -183,8 +163,7 @@ impl Master {
 pub struct Handle {
     inbox: mpsc::Sender<Event>,
     jobs: Arc<Jobs>,
-    served: Arc<ServedVolume>,
-    volume: Arc<Volume>,
+    library: Arc<Library>,
     planning: Arc<Semaphore>,
     shares: Shares,
     peer_limits: PeerLimits,
@@ -193,21 +172,35 @@ pub struct Handle {
 }
 
 impl Handle {
-    /// Returns the description of the volume that is served.
-    pub fn volume(&self) -> &ServedVolume {
-        &self.served
+    /// Returns the volumes of the master.
+    pub fn library(&self) -> &Arc<Library> {
+        &self.library
     }
 
-    /// Returns the volume's name as a caller at `peer` may know it: its file's name may be a
-    /// patient's, so others than this machine's callers get the first digits of its digest.
-    pub(crate) fn name_for(&self, peer: Option<IpAddr>) -> String {
-        let is_own = peer.is_none_or(|ip| ip.to_canonical().is_loopback());
-        if is_own || self.show_names {
-            return self.served.name.clone();
-        }
-        let mut digest = self.served.info.digest.to_string();
-        digest.truncate(12);
-        format!("sha256:{digest}")
+    /// Returns who calls from `peer`, as the library knows callers.
+    pub(crate) fn viewer(&self, peer: Option<IpAddr>) -> Viewer {
+        Viewer::at(peer, self.show_names)
+    }
+
+    /// Runs what may read a volume's file, on a blocking thread; at most [`PLANS_AT_ONCE`] run at a
+    /// time. `None` if the master is gone.
+    pub(crate) async fn with_library<T: Send + 'static>(
+        &self,
+        run: impl FnOnce(&Library) -> T + Send + 'static,
+    ) -> Option<T> {
+        let place = self.planning.clone().acquire_owned().await.ok()?;
+        let library = self.library.clone();
+        let done = tokio::task::spawn_blocking(move || {
+            let _place = place;
+            run(&library)
+        });
+        done.await.ok()
+    }
+
+    /// Returns whether a job in progress draws the volume with this digest.
+    pub(crate) fn is_drawn(&self, volume: Digest32) -> bool {
+        let table = self.jobs.lock();
+        table.jobs().any(|job| job.view.volume == volume && !job.view.state.is_over())
     }
 
     /// Returns what one address may have at a time.
@@ -249,13 +242,14 @@ impl Handle {
         // Whom the driver would turn away costs no check.
         let _checking = self.jobs.reserve(request.held_bytes(), peer, self.peer_limits.jobs)?;
         let place = self.planning.clone().acquire_owned().await.map_err(|_| SubmitError::Gone)?;
-        let (served, hooks) = (self.served.clone(), self.hooks.clone());
-        let (volume, shares) = (self.volume.clone(), self.shares);
+        let (library, hooks) = (self.library.clone(), self.hooks.clone());
+        let (viewer, shares) = (self.viewer(peer), self.shares);
         let planned = tokio::task::spawn_blocking(move || {
             let _place = place;
             caught("checking the request", || {
                 hooks.reach(Stage::Plan);
-                Plan::new(request, &served, &volume, &shares)
+                let OpenVolume { served, volume } = library.open(&request.volume, viewer)?;
+                Plan::new(request, &served, &volume, &shares).map_err(SubmitError::from)
             })
         });
         let plan = planned.await.map_err(|_| SubmitError::Gone)?;

@@ -1,4 +1,4 @@
-//! The master: it serves one volume and the task queue.
+//! The master: it serves volumes and the task queue.
 //!
 //! - [`handle`] starts a master and is how everybody speaks to it.
 //! - `driver` is one thread that owns the scheduler (a pure state machine) and carries out its
@@ -8,6 +8,7 @@
 //! - [`jobs`] is the table of view paths and their finished frames, shared with whoever waits for
 //!   them; [`jobs::submit`] checks requests.
 //! - [`finish`] turns finished sums into pictures, hashes and bytes, on threads beside the driver.
+//! - [`library`] has the volumes, by name and digest, and reads them when they are needed.
 //! - [`memory`] says what a master may hold.
 //! - [`link`] is the driver's end of a link to a worker, and the embedded link without a network.
 //! - [`record`] writes down what the scheduler is told and decides, and replays it.
@@ -53,6 +54,7 @@ mod finishers;
 pub mod handle;
 mod hooks;
 pub mod jobs;
+pub mod library;
 pub mod link;
 pub mod memory;
 mod panics;
@@ -60,6 +62,7 @@ pub mod record;
 pub mod serve;
 
 pub use admission::AttachError;
-pub use handle::{Handle, Master, MasterConfig, ServedVolume};
+pub use handle::{Handle, Master, MasterConfig};
 pub use jobs::submit::SubmitError;
+pub use library::{Library, LibraryConfig, ServedVolume};
 pub use serve::PeerLimits;

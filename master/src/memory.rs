@@ -10,7 +10,7 @@
 
 use slabcast_common::image::{FrameState, PixelFormat};
 use slabcast_common::quality::{InvalidField, Schedule};
-use slabcast_common::volume::Volume;
+use slabcast_common::volume::VolumeInfo;
 use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_scene::request::PathRequest;
 
@@ -103,13 +103,9 @@ fn sums_bytes(schedule: Schedule, hashed: bool) -> u64 {
 }
 
 /// Returns an upper bound of the bytes of a brick set.
-pub(crate) fn brick_set_bytes(volume: &Volume, needs: &BrickNeeds) -> u64 {
+pub(crate) fn brick_set_bytes(volume: &VolumeInfo, needs: &BrickNeeds) -> u64 {
     let voxels: u64 = volume.lattice.dims.iter().map(|&n| u64::from(n)).product();
-    let sample = match volume.samples {
-        slabcast_common::volume::Samples::U8(_) => 1,
-        slabcast_common::volume::Samples::U16(_) => 2,
-        slabcast_common::volume::Samples::F32(_) => 4,
-    };
+    let sample = volume.summary.kind.bytes() as u64;
     // A voxel's index within its brick takes up to two bytes.
     voxels * (2 + sample + 2 * u64::from(needs.normals) + u64::from(needs.gradients))
 }

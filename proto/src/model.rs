@@ -7,7 +7,7 @@ use crate::convert::StatisticsPart;
 use bytes::Bytes;
 use slabcast_common::ids::WorkerId;
 use slabcast_common::image::PixelFormat;
-use slabcast_common::volume::VolumeInfo;
+use slabcast_common::volume::{Digest32, SampleKind, VolumeInfo};
 use slabcast_scene::path::Orientation;
 use std::time::Duration;
 
@@ -93,9 +93,81 @@ pub struct Job {
     pub submitted_unix_ms: i64,
     /// Time at which the job reached a final state, in milliseconds since 1970 UTC; 0 before.
     pub finished_unix_ms: i64,
+    /// Digest and name of the volume that it draws; `None` of a master that does not say.
+    pub volume: Option<(Digest32, String)>,
 }
 
-/// The volume that a master serves.
+/// A volume in a master's list.
+#[derive(Clone, Debug, PartialEq)]
+pub struct VolumeEntry {
+    /// Name of the volume, as the caller may know it.
+    pub name: String,
+    /// Digest, numbers of samples and their type; `None` while the file was not read.
+    pub read: Option<(Digest32, [u32; 3], SampleKind)>,
+    /// Bytes of the samples, or of the file while it was not read; 0 of a folder.
+    pub bytes: u64,
+    /// Where it comes from.
+    pub origin: VolumeOrigin,
+    /// Whether its samples are in memory.
+    pub in_memory: bool,
+    /// Why its file can't be read, if that was tried; empty otherwise.
+    pub problem: String,
+}
+
+/// A page of a master's volumes, and what the master says of itself.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct VolumeList {
+    /// Volumes, by name.
+    pub volumes: Vec<VolumeEntry>,
+    /// Version of the pixels, `PIXELS_VERSION`, of the master's program.
+    pub pixels_version: u32,
+    /// The master's `PROTOCOL_VERSION`: the newest version of `slabcast.cluster.v1` it speaks.
+    pub protocol_version: u32,
+    /// The master's clock, in milliseconds since 1970 UTC; 0 if it does not say.
+    pub now_unix_ms: i64,
+}
+
+/// Where a volume of a master comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum VolumeOrigin {
+    /// The master was started with it.
+    Given,
+    /// A file of the master's folder of volumes.
+    Folder,
+    /// A client put it there.
+    Upload,
+}
+
+/// A volume that a client puts on a master, without its samples.
+#[derive(Clone, Debug, PartialEq)]
+pub struct VolumeHeader {
+    /// Name that it gets.
+    pub name: String,
+    /// The sample type in the file, for people.
+    pub file_type: String,
+    /// Lattice, values and digest. A master counts range and histogram itself.
+    pub info: VolumeInfo,
+    /// Axes that are up and front unless a path says otherwise.
+    pub orientation: Orientation,
+}
+
+/// A part of an upload.
+#[derive(Clone, Debug, PartialEq)]
+pub enum UploadPart {
+    /// What is uploaded.
+    Begin(Box<VolumeHeader>),
+    /// Bytes of its samples.
+    Chunk {
+        /// Digest of the volume.
+        digest: Digest32,
+        /// Offset of `data` among the bytes of the samples.
+        offset: u64,
+        /// The bytes, little-endian.
+        data: Bytes,
+    },
+}
+
+/// A volume of a master.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VolumeDescription {
     /// Name of the volume's file, without folders.

@@ -31,6 +31,18 @@ pub enum Reason {
     FrameNotKept,
     /// The master is ending.
     MasterEnding,
+    /// The master has no volume of this name or digest.
+    VolumeNotFound,
+    /// The file of a volume can't be read.
+    VolumeNotReadable,
+    /// The master has no memory, or no place, for a volume.
+    NoRoomForVolume,
+    /// Another volume has the name.
+    VolumeNameTaken,
+    /// A volume can't be removed.
+    VolumeInUse,
+    /// The master takes no volumes of clients.
+    UploadsRefused,
     /// The Bricks stream of a worker's link ended.
     BricksEnded,
     /// A worker's message came out of order.
@@ -43,7 +55,7 @@ pub enum Reason {
 
 impl Reason {
     /// Every reason.
-    const ALL: [Reason; 12] = [
+    const ALL: [Reason; 18] = [
         Reason::InvalidField,
         Reason::ClientKeyTaken,
         Reason::TooManyJobs,
@@ -52,6 +64,12 @@ impl Reason {
         Reason::FrameBeyondEnd,
         Reason::FrameNotKept,
         Reason::MasterEnding,
+        Reason::VolumeNotFound,
+        Reason::VolumeNotReadable,
+        Reason::NoRoomForVolume,
+        Reason::VolumeNameTaken,
+        Reason::VolumeInUse,
+        Reason::UploadsRefused,
         Reason::BricksEnded,
         Reason::OutOfOrder,
         Reason::SessionUnknown,
@@ -69,6 +87,12 @@ impl Reason {
             Reason::FrameBeyondEnd => "FRAME_BEYOND_END",
             Reason::FrameNotKept => "FRAME_NOT_KEPT",
             Reason::MasterEnding => "MASTER_ENDING",
+            Reason::VolumeNotFound => "VOLUME_NOT_FOUND",
+            Reason::VolumeNotReadable => "VOLUME_NOT_READABLE",
+            Reason::NoRoomForVolume => "NO_ROOM_FOR_VOLUME",
+            Reason::VolumeNameTaken => "VOLUME_NAME_TAKEN",
+            Reason::VolumeInUse => "VOLUME_IN_USE",
+            Reason::UploadsRefused => "UPLOADS_REFUSED",
             Reason::BricksEnded => "BRICKS_ENDED",
             Reason::OutOfOrder => "OUT_OF_ORDER",
             Reason::SessionUnknown => "SESSION_UNKNOWN",
@@ -76,16 +100,35 @@ impl Reason {
         }
     }
 
+    /// Returns whether the reason lies in a volume: that it is not there, not readable, not taken or not
+    /// removed.
+    pub fn is_of_volume(self) -> bool {
+        matches!(
+            self,
+            Reason::VolumeNotFound
+                | Reason::VolumeNotReadable
+                | Reason::NoRoomForVolume
+                | Reason::VolumeNameTaken
+                | Reason::VolumeInUse
+                | Reason::UploadsRefused
+        )
+    }
+
     /// Returns the status code that goes with this reason.
     pub fn code(self) -> Code {
         match self {
             Reason::InvalidField => Code::InvalidArgument,
-            Reason::ClientKeyTaken => Code::AlreadyExists,
-            Reason::TooManyJobs | Reason::TooManyWatchers => Code::ResourceExhausted,
-            Reason::JobNotFound => Code::NotFound,
+            Reason::ClientKeyTaken | Reason::VolumeNameTaken => Code::AlreadyExists,
+            Reason::TooManyJobs | Reason::TooManyWatchers | Reason::NoRoomForVolume => {
+                Code::ResourceExhausted
+            }
+            Reason::JobNotFound | Reason::VolumeNotFound => Code::NotFound,
             Reason::FrameBeyondEnd => Code::OutOfRange,
             Reason::MasterEnding | Reason::BricksEnded => Code::Unavailable,
             Reason::FrameNotKept
+            | Reason::VolumeNotReadable
+            | Reason::VolumeInUse
+            | Reason::UploadsRefused
             | Reason::OutOfOrder
             | Reason::SessionUnknown
             | Reason::TooLate => Code::FailedPrecondition,
@@ -203,7 +246,7 @@ mod tests {
     fn error_reasons_have_the_names_that_render_proto_lists() {
         for number in 1.. {
             let Ok(reason) = ErrorReason::try_from(number) else {
-                assert_eq!(number, 9, "reasons of render.proto");
+                assert_eq!(number, 15, "reasons of render.proto");
                 break;
             };
             let name = reason.as_str_name().trim_start_matches("ERROR_REASON_");

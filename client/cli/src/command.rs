@@ -3,7 +3,7 @@
 use crate::lab::{self, LabArgs, LabCommand};
 use crate::{
     cancel, completions, config, convert, demo, doctor, help, info, jobs, logging, man, master,
-    read_dicom, render, rerender, status, tf, worker,
+    read_dicom, render, rerender, status, tf, volumes, worker,
 };
 use clap::{Arg, Command, CommandFactory, Parser, Subcommand};
 use std::fmt::Write;
@@ -49,6 +49,9 @@ pub(crate) enum Commands {
     Status(status::StatusArgs),
     Jobs(jobs::JobsArgs),
     Cancel(cancel::CancelArgs),
+    Volumes(volumes::VolumesArgs),
+    Put(Box<volumes::PutArgs>),
+    Rm(volumes::RmArgs),
     Lab(LabArgs),
     Config(config::ConfigArgs),
     Doctor(doctor::DoctorArgs),
@@ -65,7 +68,7 @@ pub(crate) enum Commands {
 /// Groups of the help and their commands, in its order.
 pub(crate) const GROUPS: [(&str, &[&str]); 4] = [
     ("Pictures", &["render", "rerender", "info", "convert", "tf", "demo"]),
-    ("Cluster", &["master", "worker", "status", "jobs", "cancel"]),
+    ("Cluster", &["master", "worker", "status", "jobs", "cancel", "volumes", "put", "rm"]),
     ("Laboratory", &["lab"]),
     ("Setup", &["config", "doctor", "completions", "man", "help"]),
 ];
@@ -75,9 +78,9 @@ Examples:
   slabcast demo                                  pictures without any file
   slabcast render brain.nii.gz                   18 pictures of a turn, in slabcast-out/
   slabcast info brain.nii.gz                     what is in the file
-  slabcast master --volume brain.nii.gz          a cluster: a master,
+  slabcast master --volumes scans/               a cluster: a master,
   slabcast worker --master 127.0.0.1:7433        workers, here or elsewhere,
-  slabcast render --master 127.0.0.1:7433        and pictures from it
+  slabcast render knee --master 127.0.0.1:7433   and pictures from it
 
 Each command has its own help: slabcast render -h for one screen, slabcast help render for all.
 ";

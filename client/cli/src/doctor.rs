@@ -231,36 +231,34 @@ async fn master(address: &str) -> Result<Vec<Found>, String> {
     let fail = |e: slabcast_client::ClientError| e.to_string();
     let client = Client::connect(address).await.map_err(fail)?;
     let (began, now) = (Instant::now(), SystemTime::now());
-    let volume = client.volume().await.map_err(fail)?;
+    let list = client.volumes().await.map_err(fail)?;
     // The answer was given half-way.
     let round_trip = began.elapsed();
     let here = now.duration_since(UNIX_EPOCH).unwrap_or_default() + round_trip / 2;
     let workers = client.workers().await.map_err(fail)?;
     let threads: u32 = workers.iter().map(|w| w.threads).sum();
-    let says = format!(
-        "{address} serves {} with {} workers, {threads} threads",
-        volume.name,
-        workers.len()
-    );
+    let what = match &list.volumes[..] {
+        [] => "no volume yet".to_owned(),
+        [one] => one.name.clone(),
+        all => format!("{} volumes", all.len()),
+    };
+    let says = format!("{address} serves {what} with {} workers, {threads} threads", workers.len());
     let mut all = vec![if workers.is_empty() {
         let remedy = format!("start some: `slabcast worker --master {address}`");
         found("master", State::Warning, says, remedy)
     } else {
         well("master", says)
     }];
-    let versions = format!(
-        "pixels {}, protocol {} at the master",
-        volume.pixels_version, volume.protocol_version
-    );
-    let same =
-        volume.pixels_version == PIXELS_VERSION && volume.protocol_version == PROTOCOL_VERSION;
+    let versions =
+        format!("pixels {}, protocol {} at the master", list.pixels_version, list.protocol_version);
+    let same = list.pixels_version == PIXELS_VERSION && list.protocol_version == PROTOCOL_VERSION;
     all.push(if same {
         well("versions", versions)
     } else {
         let remedy = "run the same version of slabcast on all machines";
         found("versions", State::Bad, versions, remedy)
     });
-    all.push(clock(volume.now_unix_ms, here, round_trip));
+    all.push(clock(list.now_unix_ms, here, round_trip));
     Ok(all)
 }
 

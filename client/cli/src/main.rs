@@ -31,6 +31,7 @@ mod status;
 mod systemd;
 mod tf;
 mod usage;
+mod volumes;
 mod worker;
 
 use clap::FromArgMatches;
@@ -71,6 +72,9 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Commands::Status(args) => status::run(args),
         Commands::Jobs(args) => jobs::run(args),
         Commands::Cancel(args) => cancel::run(args),
+        Commands::Volumes(args) => volumes::list(args),
+        Commands::Put(args) => volumes::put(args),
+        Commands::Rm(args) => volumes::remove(args),
         Commands::Lab(args) => lab::run(args),
         Commands::Config(args) => config::run(args, config, &command(), usage::understood),
         Commands::Doctor(args) => doctor::run(args, config::path(config, command())),

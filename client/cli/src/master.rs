@@ -1,21 +1,25 @@
-//! `slabcast master`: serves a volume to workers and takes jobs from clients.
+//! `slabcast master`: serves volumes to workers and takes jobs from clients.
 //!
 //! Says READY to systemd, answers its watchdog, and on SIGTERM or Ctrl-C stops gracefully within
 //! ten seconds and ends with 0. Every flag has a variable of the environment ([`crate::config`]),
 //! so that a unit file needs none.
 
 use crate::systemd::{self, DRAIN};
+use slabcast_common::volume::Volume;
+use slabcast_master::library::{ReadFile, Unreadable, UploadConfig, Viewer};
 use slabcast_master::memory::{Shares, available};
-use slabcast_master::{MasterConfig, PeerLimits};
-use slabcast_scene::path::Axis;
+use slabcast_master::{Library, LibraryConfig, MasterConfig, PeerLimits};
+use slabcast_scene::path::{Axis, Orientation};
 use slabcast_session::embedded::start_master;
 use slabcast_session::fail::{Fail, reason, say};
 use slabcast_session::machine::boot_id;
 use slabcast_session::progress::bytes;
 use slabcast_session::request::AxisArgs;
 use slabcast_session::{parse, record, runtime, signals, volume};
+use slabcast_volumes::{OpenError, OpenErrorKind};
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::{TcpListener, TcpSocket};
 use tokio::sync::watch;
@@ -23,9 +27,18 @@ use tracing::{info, warn};
 
 const MASTER_EXAMPLES: &str = "\
 Examples:
-  slabcast master --volume brain.nii.gz
+  slabcast master --volumes scans/
   slabcast worker --master 127.0.0.1:7433        (as often as you like, here or elsewhere)
+  slabcast volumes
+  slabcast render knee --master 127.0.0.1:7433 -o out/
+
+  One volume, which needs no name:
+  slabcast master --volume brain.nii.gz
   slabcast render --master 127.0.0.1:7433 -o out/
+
+  No volumes yet; clients put theirs:
+  slabcast master
+  slabcast render knee.nrrd --master 127.0.0.1:7433 -o out/
 
   For workers on other machines, on a network that you trust:
   slabcast master --volume brain.nii.gz --listen 0.0.0.0:7433 --insecure";
@@ -34,12 +47,25 @@ Examples:
 /// brick sets of mri256.
 const MEMORY: u64 = 512 << 20;
 
-/// Serves a volume to workers and takes jobs from clients.
+/// Serves volumes to workers and takes jobs from clients.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = MASTER_EXAMPLES)]
 pub(crate) struct MasterArgs {
     #[arg(long, value_name = "FILE", help = volume::VOLUME)]
-    volume: PathBuf,
+    volume: Option<PathBuf>,
+    /// Folder whose files are served by name, read when they are needed
+    #[arg(long, value_name = "FOLDER")]
+    volumes: Option<PathBuf>,
+    /// Folder for volumes that clients put here [default: the state folder, for each port]
+    #[arg(long, value_name = "FOLDER")]
+    uploads: Option<PathBuf>,
+    /// Bytes that volumes of clients may take on disk; 0 takes none
+    #[arg(long, value_name = "BYTES", default_value = "16GiB", value_parser = parse::memory_or_none,
+          hide_short_help = true)]
+    upload_quota: u64,
+    /// Memory for volumes of folders and clients [default: half of what is free]
+    #[arg(long, value_name = "BYTES", value_parser = parse::memory, hide_short_help = true)]
+    volume_memory: Option<u64>,
     #[command(flatten)]
     input: volume::InputArgs,
     /// World axis that is up: x, y or z with + or - [default: +z]
@@ -56,7 +82,7 @@ pub(crate) struct MasterArgs {
     #[arg(long,
           value_parser = clap::builder::FalseyValueParser::new())]
     insecure: bool,
-    /// Memory for frames, brick sets and requests, beside the volume [default: half of what is free]
+    /// Memory for frames, brick sets and requests, beside volumes [default: half of what is free]
     #[arg(long, value_name = "BYTES", value_parser = parse::memory)]
     memory: Option<u64>,
     /// Jobs in progress that one address may have
@@ -71,7 +97,7 @@ pub(crate) struct MasterArgs {
     #[arg(long, value_name = "N", default_value = "1024", hide_short_help = true,
           value_parser = clap::value_parser!(u32).range(1..=4096))]
     peer_connections: u32,
-    /// Tell clients on other machines the name of the volume's file, which may be a patient's
+    /// Tell clients on other machines the names of volumes, which may be patients'
     #[arg(long, value_parser = clap::builder::FalseyValueParser::new())]
     show_names: bool,
     /// Events and decisions of the scheduler, for `slabcast lab replay`; some 25 KB a frame
@@ -103,14 +129,25 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
     // The address is taken before the volume is read, so that a port in use is told at once;
     // it is opened after, so that whoever gets through gets an answer.
     let socket = runtime.block_on(bind(&args.listen, args.insecure))?;
-    let volume = args.input.open(&args.volume)?;
-    let (name, lattice) = (volume.name.clone(), volume.lattice);
-    let orientation = axes.for_volume(&volume)?;
-    let voxels: u64 = lattice.dims.iter().map(|&n| u64::from(n)).product();
-    let volume_bytes = voxels * volume.samples.kind().bytes() as u64;
-    let mut config = MasterConfig::new(volume, orientation);
+    let address = runtime.block_on(async { socket.local_addr() });
+    let port = address.map_or(0, |address| address.port());
+    let given = match &args.volume {
+        Some(path) => {
+            let volume = args.input.open(path)?;
+            let orientation = axes.for_volume(&volume)?;
+            Some((Arc::new(volume), orientation))
+        }
+        None => None,
+    };
+    let name = given.as_ref().map_or_else(|| "volumes".to_owned(), |(v, _)| v.name.clone());
+    let dims = given.as_ref().map(|(v, _)| v.lattice.dims);
+    let volume_bytes =
+        given.as_ref().map_or(0, |(v, _)| (v.samples.len() * v.samples.kind().bytes()) as u64);
+    let library = library(args, given, port)?;
+    let volumes = library.list(Viewer::own()).len();
+    let mut config = MasterConfig::of(library);
     config.shares = shares(args.memory);
-    tell_memory(volume_bytes, &config.shares);
+    tell_memory(volume_bytes, args.volume_memory(), &config.shares);
     config.peer_limits = PeerLimits {
         jobs: args.peer_jobs as usize,
         watchers: args.peer_watchers as usize,
@@ -127,7 +164,8 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
         warn!("--rehearse: this master's pictures are stripes, whatever is asked for");
     }
     if let Some(path) = &args.record {
-        record::check_path(path, &[&args.volume])?;
+        let inputs: Vec<&Path> = args.volume.iter().map(PathBuf::as_path).collect();
+        record::check_path(path, &inputs)?;
     }
     let mut recording = None;
     let result = runtime.block_on(async {
@@ -147,8 +185,7 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
         if args.insecure && !address.ip().is_loopback() {
             warn!("--insecure: whoever reaches {address} may read the volume and submit jobs");
         }
-        info!(%address, volume = name, dims = ?lattice.dims, %orientation.up, %orientation.front,
-              "listening");
+        info!(%address, volumes, volume = name, ?dims, "listening");
         // Nobody may read stdout (systemd closes it): that is no reason to end.
         let _ = say(&format!("listening on {address}\n"));
         systemd::ready(&format!("serving {name} on {address}"));
@@ -197,11 +234,82 @@ fn shares(memory: Option<u64>) -> Shares {
     memory.or_else(half).map_or_else(Shares::default, Shares::of)
 }
 
+impl MasterArgs {
+    /// Bytes of samples of volumes that are read when they are needed.
+    fn volume_memory(&self) -> u64 {
+        let half = || available().map_or(u64::MAX, |free| (free / 2).max(MEMORY));
+        self.volume_memory.unwrap_or_else(half)
+    }
+}
+
+/// Returns the volumes of the master: the one that was `given`, those of folders, and those of clients.
+fn library(
+    args: &MasterArgs,
+    given: Option<(Arc<Volume>, Orientation)>,
+    port: u16,
+) -> Result<Library, Fail> {
+    let axes = AxisArgs { up: args.up, front: args.front };
+    let input = args.input.clone();
+    let read: ReadFile = Arc::new(move |path, most_bytes| {
+        let opened = input.read(path, most_bytes);
+        // Clients are told the file's name, not its folder.
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let (volume, notes) = opened.map_err(|e| {
+            let is_too_large = e.problem.kind == OpenErrorKind::TooLarge;
+            Unreadable { reason: OpenError { file: name, ..e }.to_string(), is_too_large }
+        })?;
+        for note in notes {
+            info!(volume = volume.name, "{note}");
+        }
+        let orientation = axes.for_volume(&volume).map_err(|e| {
+            let reason = e.line().unwrap_or_default().to_owned();
+            Unreadable { reason, is_too_large: false }
+        })?;
+        Ok((volume, orientation))
+    });
+    let folder = match &args.uploads {
+        _ if args.upload_quota == 0 => None,
+        Some(folder) => Some(folder.clone()),
+        None => uploads_folder(port),
+    };
+    let config = |folder: Option<PathBuf>| LibraryConfig {
+        given: given.clone(),
+        folder: args.volumes.clone(),
+        uploads: folder.map(|folder| UploadConfig { folder, quota_bytes: args.upload_quota }),
+        memory_bytes: args.volume_memory(),
+        read: read.clone(),
+    };
+    match Library::new(config(folder)) {
+        Ok(library) => Ok(library),
+        // Nobody asked for the default folder.
+        Err(e) if args.uploads.is_none() && e.starts_with("--uploads") => {
+            warn!("no volumes of clients are taken: {e}");
+            Library::new(config(None)).map_err(|e| Fail::failed(format!("--volumes {e}")))
+        }
+        Err(e) if e.starts_with("--uploads") => Err(Fail::failed(e)),
+        Err(e) => Err(Fail::failed(format!("--volumes {e}"))),
+    }
+}
+
+/// Returns where volumes of clients go by default: a folder for each port, so that two masters of one
+/// user don't share it. `None` of a port that was not chosen, or a user without a home.
+fn uploads_folder(port: u16) -> Option<PathBuf> {
+    let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    let state = || {
+        variable("XDG_STATE_HOME")
+            .or_else(|| variable("HOME").map(|home| home.join(".local/state")))
+            .map(|folder| folder.join("slabcast"))
+    };
+    let folder = variable("STATE_DIRECTORY").or_else(state)?;
+    (port > 0).then(|| folder.join(format!("volumes-{port}")))
+}
+
 /// Says what the master will hold at most.
-fn tell_memory(volume_bytes: u64, shares: &Shares) {
+fn tell_memory(volume_bytes: u64, volume_memory: u64, shares: &Shares) {
     let largest = shares.largest_frame.map_or_else(|| "all that is free".into(), bytes);
     info!(
         volume = bytes(volume_bytes),
+        other_volumes = if volume_memory == u64::MAX { "any".into() } else { bytes(volume_memory) },
         frames = bytes(shares.frames),
         largest_frame = largest,
         brick_sets = if shares.bricks == u64::MAX { "any".into() } else { bytes(shares.bricks) },

@@ -1,13 +1,16 @@
-//! `slabcast status`: a master's volume, its workers and the jobs that are not over.
+//! `slabcast status`: a master's volumes, its workers and the jobs that are not over.
 
 use crate::master_client::{MasterArg, ask, job_json, job_table, table};
-use slabcast_client::{Job, VolumeDescription, Worker};
+use crate::volumes::{entry_json, volume_table};
+use slabcast_client::{Job, VolumeDescription, VolumeOrigin, Worker};
+use slabcast_scene::path::Orientation;
+use slabcast_scene::request::VolumeChoice;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress::{bytes, time};
 use std::fmt::Write;
 use std::time::Duration;
 
-/// Shows a master's volume, its workers and its open jobs.
+/// Shows a master's volumes, its workers and its open jobs.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -23,32 +26,55 @@ pub(crate) struct StatusArgs {
 
 /// Runs `slabcast status`.
 pub(crate) fn run(args: &StatusArgs) -> Result<(), Fail> {
-    let (volume, workers, jobs) = ask(&args.master.address, async |client| {
-        Ok((client.volume().await?, client.workers().await?, client.jobs(1000).await?))
+    let (list, given, workers, jobs) = ask(&args.master.address, async |client| {
+        let list = client.volumes().await?;
+        // The volume of the start is in memory; to describe another, its file might have to be read.
+        let given = match list.volumes.iter().any(|v| v.origin == VolumeOrigin::Given) {
+            true => Some(client.volume(&VolumeChoice::Default).await?),
+            false => None,
+        };
+        Ok((list, given, client.workers().await?, client.jobs(1000).await?))
     })?;
     if args.json {
         return say(&format!(
             "{:#}\n",
             serde_json::json!({
                 "master": args.master.address,
-                "volume": volume_json(&volume),
+                "volume": given.as_ref().map(volume_json),
+                "volumes": list.volumes.iter().map(entry_json).collect::<Vec<_>>(),
+                "pixels_version": list.pixels_version,
+                "protocol_version": list.protocol_version,
                 "workers": workers.iter().map(worker_json).collect::<Vec<_>>(),
                 "jobs": jobs.iter().map(job_json).collect::<Vec<_>>(),
             })
         ));
     }
     let mut out = String::new();
-    let [x, y, z] = volume.info.lattice.dims;
     // Writing to a string does not fail.
-    let _ = writeln!(
-        out,
-        "master   {}\nvolume   {}, {x} x {y} x {z} {}, up {}, front {}",
-        args.master.address,
-        volume.name,
-        volume.file_type,
-        volume.orientation.up,
-        volume.orientation.front
-    );
+    let _ = writeln!(out, "master   {}", args.master.address);
+    match &given {
+        Some(volume) => {
+            let [x, y, z] = volume.info.lattice.dims;
+            let Orientation { up, front } = volume.orientation;
+            let _ = writeln!(
+                out,
+                "volume   {}, {x} x {y} x {z} {}, up {up}, front {front}",
+                volume.name, volume.file_type
+            );
+        }
+        None if list.volumes.is_empty() => {
+            let _ = writeln!(
+                out,
+                "volumes  none: put one there with `slabcast put FILE --master {}`",
+                args.master.address
+            );
+        }
+        None => {}
+    }
+    if list.volumes.len() > usize::from(given.is_some()) {
+        let _ = writeln!(out, "volumes  {}", list.volumes.len());
+        volume_table(&mut out, &list.volumes);
+    }
     if workers.is_empty() {
         let _ = writeln!(
             out,

@@ -14,7 +14,7 @@ use slabcast_common::volume::Volume;
 use slabcast_master::SubmitError;
 use slabcast_master::jobs::{JobState, WatchItem};
 use slabcast_master::record::Recorder;
-use slabcast_master::{Handle, Master, MasterConfig, link};
+use slabcast_master::{Handle, Master, MasterConfig, ServedVolume, link};
 use slabcast_render::Simd;
 use slabcast_scene::path::Orientation;
 use slabcast_scene::request::PathRequest;
@@ -119,6 +119,12 @@ impl Cluster {
     /// Returns a handle to the master.
     pub fn handle(&self) -> Handle {
         self.master.handle()
+    }
+
+    /// Returns the description of the master's volume.
+    pub fn volume(&self) -> Arc<ServedVolume> {
+        let served = self.master.handle().library().default_volume();
+        served.expect("a cluster in this process has the volume that it was started with")
     }
 
     /// Waits for a worker to end without having been told to, which should not happen, and

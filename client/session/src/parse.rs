@@ -150,6 +150,14 @@ pub fn memory(text: &str) -> Result<u64, String> {
     if range.contains(&bytes) { Ok(bytes as u64) } else { Err(bad()) }
 }
 
+/// Bytes as [`memory`] takes them, or 0 for none.
+///
+/// # Errors
+/// Neither.
+pub fn memory_or_none(text: &str) -> Result<u64, String> {
+    if text == "0" { Ok(0) } else { memory(text).map_err(|e| format!("{e}; or 0 for none")) }
+}
+
 /// `HOST:PORT` or `HOST` with the default port, the name not looked up yet. Port 0 (any free one) only
 /// where `any_port`.
 fn host_port(text: &str, any_port: bool) -> Result<String, String> {

@@ -138,6 +138,15 @@ impl Progress {
         }
     }
 
+    /// Shows how much of an upload is there, in bytes; `what` is the line for a log.
+    pub fn uploaded(&mut self, there: u64, total: u64, what: &str) {
+        let mib = |bytes: u64| bytes.div_ceil(1 << 20);
+        if self.total == 0 {
+            self.frames(mib(total).max(1), &format!("sending {what}, {}", bytes(total)));
+        }
+        self.step(Step { frames: there >> 20, ..Step::default() });
+    }
+
     /// Shows how far the run has come.
     pub fn step(&mut self, step: Step) {
         if step.frames > 0 && self.first.is_none() {

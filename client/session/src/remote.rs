@@ -6,11 +6,13 @@ use crate::progress::Step;
 use crate::request::RenderRequest;
 use crate::source::{Cancel, Source, Update};
 use slabcast_client::{
-    Client, ClientError, JobState, PATIENCE, Submitted, VolumeDescription, local_field,
+    Client, ClientError, JobState, PATIENCE, Reason, Submitted, VolumeDescription, VolumeHeader,
+    local_field,
 };
 use slabcast_common::quality::InvalidField;
-use slabcast_common::volume::Digest32;
-use slabcast_scene::request::PathRequest;
+use slabcast_common::volume::Volume;
+use slabcast_scene::path::Orientation;
+use slabcast_scene::request::{PathRequest, VolumeChoice};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
 
@@ -39,12 +41,17 @@ pub async fn connect(master: &str) -> Result<Client, Fail> {
     Client::connect(master).await.map_err(|e| client_failure(&e))
 }
 
-/// Returns the volume that a master serves; warns if its pixels are of another version.
+/// Returns a volume of a master; warns if its pixels are of another version.
 ///
 /// # Errors
-/// The master doesn't answer.
-pub async fn describe(client: &Client) -> Result<VolumeDescription, Fail> {
-    let served = client.volume().await.map_err(|e| client_failure(&e))?;
+/// The master has no such volume, or doesn't answer.
+pub async fn describe(client: &Client, choice: &VolumeChoice) -> Result<VolumeDescription, Fail> {
+    let served = client.volume(choice).await.map_err(|e| match &e {
+        ClientError::InvalidField { field, problem } if field == "volume" => {
+            Fail::usage(format!("VOLUME: {problem}"))
+        }
+        _ => client_failure(&e),
+    })?;
     if served.pixels_version != slabcast_common::PIXELS_VERSION {
         crate::progress::warn(&format!(
             "{} draws pixels of version {}, this program those of {}: hashes will differ; run the \
@@ -57,16 +64,42 @@ pub async fn describe(client: &Client) -> Result<VolumeDescription, Fail> {
     Ok(served)
 }
 
+/// Puts a volume on a master, unless it has it. If another volume there has its name, it gets one with
+/// digits of its digest. `told` is called with the bytes that the master has and those of all samples.
+///
+/// # Errors
+/// The master refuses the volume, or stays away.
+pub async fn put(
+    client: &Client,
+    volume: &Volume,
+    orientation: Orientation,
+    (name, is_chosen): (&str, bool),
+    mut told: impl FnMut(u64, u64),
+) -> Result<VolumeDescription, Fail> {
+    let info = volume.info(volume.digest());
+    let digest = info.digest;
+    let total = (volume.samples.len() * volume.samples.kind().bytes()) as u64;
+    let file_type = volume.file_type.clone();
+    let mut header = VolumeHeader { name: name.to_owned(), file_type, info, orientation };
+    let mut put = client.put_volume(&header, &volume.samples, |there| told(there, total)).await;
+    if let Err(ClientError::Volume { reason: Reason::VolumeNameTaken, .. }) = put
+        && !is_chosen
+    {
+        header.name = format!("{name}-{}", &digest.to_string()[..8]);
+        put = client.put_volume(&header, &volume.samples, |there| told(there, total)).await;
+    }
+    put.map_err(|e| client_failure(&e))?;
+    describe(client, &VolumeChoice::Digest(digest)).await
+}
+
 /// Submits a path to a master behind a network and returns its updates.
 ///
 /// # Errors
-/// The master refuses the request, serves another volume than the one with this digest, or doesn't
-/// answer.
+/// The master refuses the request, or doesn't answer.
 pub async fn submit(
     client: Client,
     request: &RenderRequest,
     message: PathRequest,
-    volume: Digest32,
 ) -> Result<Source, Fail> {
     let submitted = client.submit_framed(&message).await.map_err(|e| match &e {
         ClientError::InvalidField { field, problem } => {
@@ -75,46 +108,21 @@ pub async fn submit(
         _ => client_failure(&e),
     })?;
     let Submitted { job, framing } = submitted;
-    check_volume(&client, &job, volume).await?;
     let (name, job_now) = watch::channel(job);
     let (to, updates) = mpsc::channel(1);
     let cancel = Cancel::new(cancel(client.clone(), job_now));
     tokio::spawn(async move {
-        if let Err(e) = pump(&client, message, volume, name, &to).await {
+        if let Err(e) = pump(&client, message, name, &to).await {
             let _ = to.send(Err(e)).await;
         }
     });
     Ok(Source { updates, cancel, framing })
 }
 
-/// Checks that a master serves the volume with digest `volume`, and cancels `job` if not. To be called
-/// after the job was submitted: a master that restarts with another volume later doesn't know the job.
-///
-/// # Errors
-/// The master serves another volume, or doesn't answer.
-async fn check_volume(client: &Client, job: &str, volume: Digest32) -> Result<(), Fail> {
-    let served = client.volume().await.map_err(|e| client_failure(&e))?;
-    if served.info.digest == volume {
-        return Ok(());
-    }
-    let _ = client.cancel(job).await;
-    let (was, is) = (volume.to_string(), served.info.digest.to_string());
-    Err(Fail::failed(format!(
-        "the master at {} serves another volume now: {} ({}...), and the pictures are of {}...; frames \
-         that are written show that one. Start the master with it again, or draw the new one into \
-         another folder",
-        client.address(),
-        served.name,
-        &is[..8],
-        &was[..8],
-    )))
-}
-
 /// Passes a job's updates on until its last frame.
 async fn pump(
     client: &Client,
     mut message: PathRequest,
-    volume: Digest32,
     job: watch::Sender<String>,
     to: &mpsc::Sender<Result<Update, Fail>>,
 ) -> Result<(), Fail> {
@@ -130,8 +138,17 @@ async fn pump(
                     "the master does not know the job any more; submitting it again"
                 );
                 message.client_key = crate::request::client_key();
-                let name = client.submit(&message).await.map_err(|e| client_failure(&e))?;
-                check_volume(client, &name, volume).await?;
+                // The volume is named by its digest, so no other can take its place.
+                let name = client.submit(&message).await.map_err(|e| match &e {
+                    ClientError::Volume { reason: Reason::VolumeNotFound, message } => {
+                        Fail::failed(format!(
+                            "the master at {} was restarted, and has another volume now: {message}, \
+                             and render again; the frames that are written stay right",
+                            client.address()
+                        ))
+                    }
+                    _ => client_failure(&e),
+                })?;
                 job.send_replace(name);
             }
             Err(e) => return Err(client_failure(&e)),

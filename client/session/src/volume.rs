@@ -5,7 +5,7 @@ use crate::fail::Fail;
 use crate::parse;
 use crate::progress;
 use slabcast_common::volume::Volume;
-use slabcast_volumes::{Hints, Opened, RawHints};
+use slabcast_volumes::{Hints, OpenError, Opened, RawHints};
 use std::ffi::OsString;
 use std::path::Path;
 
@@ -81,6 +81,20 @@ impl InputArgs {
         let opened = open_with(path, &self.hints())?;
         opened.notes.iter().for_each(|note| progress::note(note));
         Ok(opened.volume)
+    }
+}
+
+impl InputArgs {
+    /// Reads a file or folder whose samples take at most `most_bytes`, or as many as `--max-bytes` says
+    /// if that is less. Returns it with the reader's notes.
+    ///
+    /// # Errors
+    /// The volume can't be read.
+    pub fn read(&self, path: &Path, most_bytes: u64) -> Result<(Volume, Vec<String>), OpenError> {
+        let mut hints = self.hints();
+        hints.max_bytes = Some(hints.max_bytes.map_or(most_bytes, |asked| asked.min(most_bytes)));
+        let opened = slabcast_volumes::open_with(path, &hints)?;
+        Ok((opened.volume, opened.notes))
     }
 }
 

@@ -9,12 +9,13 @@
 //! use slabcast_common::image::{Background, PixelFormat};
 //! use slabcast_common::quality::{Quality, Work};
 //! use slabcast_scene::path::{Turntable, ViewPath};
-//! use slabcast_scene::request::PathRequest;
+//! use slabcast_scene::request::{PathRequest, VolumeChoice};
 //! use slabcast_scene::transfer::TransferChoice;
 //!
 //! let turn = Turntable { frames: 36, step: 10.0, ..Turntable::default() };
 //! let request = PathRequest {
 //!     client_key: "a movie for Monday".into(),
+//!     volume: VolumeChoice::Name("head.nii.gz".into()),
 //!     path: ViewPath::from_turntable([640, 480], turn),
 //!     transfer: TransferChoice::Name("bone".into()),
 //!     quality: Quality::default(),

@@ -5,12 +5,27 @@ use crate::transfer::TransferChoice;
 use slabcast_common::image::{Background, PixelEncoding, PixelFormat};
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::transfer::TransferFunction;
+use slabcast_common::volume::Digest32;
+
+/// Which volume of a master is meant.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum VolumeChoice {
+    /// The volume that the master was started with, or its only one.
+    #[default]
+    Default,
+    /// The volume of this name.
+    Name(String),
+    /// The volume with this digest, and never another.
+    Digest(Digest32),
+}
 
 /// A job as a client submits it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PathRequest {
     /// The client's own name for the request; the same key gives the same job.
     pub client_key: String,
+    /// Volume that is drawn.
+    pub volume: VolumeChoice,
     /// Views of the job, one for each frame.
     pub path: ViewPath,
     /// Colours and opacities of the volume: a preset or a whole transfer function.
@@ -43,8 +58,13 @@ impl PathRequest {
         let of_keys = keys
             .map(|key| size_of::<Key>() + key.tf.as_ref().map_or(0, TransferChoice::held_bytes));
         let eyes = self.path.flythrough.as_ref().map_or(0, |f| f.eyes.len());
+        let name = match &self.volume {
+            VolumeChoice::Name(name) => name.len(),
+            VolumeChoice::Default | VolumeChoice::Digest(_) => 0,
+        };
         size_of::<PathRequest>()
             + self.client_key.len()
+            + name
             + self.path.views.len() * size_of::<PathView>()
             + of_keys.sum::<usize>()
             + eyes * size_of::<[f64; 3]>()

@@ -19,12 +19,14 @@
 use super::{Driver, Event, Flight};
 use crate::hooks::Stage;
 use crate::jobs::active::Candidate;
+use crate::library::{Viewer, VolumeError};
 use crate::memory::{Shares, brick_set_bytes, making_bytes};
-use crate::panics::{Panicked, caught};
+use crate::panics::caught;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, JobId};
 use slabcast_common::link::{FRAMES_IN_FLIGHT, MOST_FRAMES_IN_FLIGHT};
 use slabcast_common::quality::Schedule;
+use slabcast_scene::request::VolumeChoice;
 use slabcast_schedule::{Clock, Event as Happened, FrameJob, Micros};
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
@@ -236,7 +238,7 @@ impl Driver {
         let Candidate { job: id, number, wanted } = candidate;
         let (making_bytes, finished_bytes) = self.bytes_of(&candidate);
         let Some(job) = self.active.get_mut(id) else { return false };
-        let view = match job.views.view(number, &self.served.info) {
+        let view = match job.views.view(number, &job.scene.volume) {
             Ok(view) => view,
             Err(e) => {
                 self.no_view(id, number, &e.to_string());
@@ -327,12 +329,13 @@ impl Driver {
         });
         let Some(job) = lacking else { return };
         let (key, needs, now) = (job.scene.bricks, job.bricks.clone(), self.clock.now());
+        let volume = &job.scene.volume;
         let flights = &self.flights;
         let in_flight = |key| flights.values().any(|f| f.store.key() == key);
         let table = self.jobs.lock();
         let is_needed = |key| self.active.open_need(&table, key);
         let stays = |key| in_flight(key) || (!comes_first && is_needed(key));
-        let bytes = brick_set_bytes(&self.volume, &needs);
+        let (bytes, digest) = (brick_set_bytes(volume, &needs), volume.digest);
         let begins = self.brick_sets.begin_cut(key, bytes, now, stays, is_needed);
         drop(table);
         if !begins && comes_first {
@@ -341,13 +344,18 @@ impl Driver {
         if !begins {
             return;
         }
-        let (volume, digest) = (self.volume.clone(), self.served.info.digest);
+        let library = self.library.clone();
         let (inbox, hooks) = (self.inbox.clone(), self.hooks.clone());
         let cut = move || {
             let store = caught("cutting bricks", || {
                 hooks.reach(Stage::CutBricks);
-                Arc::new(BrickStore::build(&volume, digest, &needs))
+                // Its samples may have been dropped since the job was submitted.
+                let volume = library.open(&VolumeChoice::Digest(digest), Viewer::own())?.volume;
+                Ok(Arc::new(BrickStore::build(&volume, digest, &needs)))
             });
+            let store = store
+                .map_err(|panicked| panicked.to_string())
+                .and_then(|store| store.map_err(|e: VolumeError| e.to_string()));
             let _ = inbox.blocking_send(Event::BricksCut { set: key, store });
         };
         let thread = std::thread::Builder::new().name("slabcast-bricks".into());
@@ -356,11 +364,7 @@ impl Driver {
         }
     }
 
-    pub(super) fn bricks_cut(
-        &mut self,
-        set: BrickSetKey,
-        store: Result<Arc<BrickStore>, Panicked>,
-    ) {
+    pub(super) fn bricks_cut(&mut self, set: BrickSetKey, store: Result<Arc<BrickStore>, String>) {
         match store {
             Ok(store) => {
                 let (bricks, bytes) = (store.infos().len(), store.bytes());
@@ -368,7 +372,7 @@ impl Driver {
                 self.brick_sets.cut(store, self.clock.now());
                 self.refresh_states();
             }
-            Err(panicked) => self.no_bricks(set, &panicked.to_string()),
+            Err(reason) => self.no_bricks(set, &reason),
         }
     }
 

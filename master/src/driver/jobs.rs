@@ -57,11 +57,11 @@ impl Driver {
     /// Makes a job active: its frames from number `next` on are drawn, and those that are wanted
     /// again.
     fn activate(&mut self, id: JobId, plan: Plan, peer: Option<IpAddr>, next: u64) {
-        let bricks = match self.brick_sets.covering(&plan.wanted) {
+        let bricks = match self.brick_sets.covering(plan.volume(), &plan.wanted) {
             Some(store) => store.needs().clone(),
             None => plan.wanted.clone(),
         };
-        let mut job = plan.activate(id, self.served.info.clone(), bricks);
+        let mut job = plan.activate(id, bricks);
         job.next = next.min(job.views.len());
         self.active.insert(id, job, peer);
         self.refresh_states();

@@ -4,6 +4,7 @@ use super::*;
 use crate::handle::{Handle, Master, MasterConfig};
 use crate::hooks::Stage;
 use crate::jobs::WatchItem;
+use crate::library::Viewer;
 use crate::memory::making_bytes;
 use crate::panics::caught;
 use slabcast_common::image::{Background, PixelFormat, SparseTile, TilePixels};
@@ -11,9 +12,10 @@ use slabcast_common::message::{Counters, Pixels, RegionCost, TaskTimes, TileResu
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_common::transfer::TransferFunction;
+use slabcast_common::volume::Volume;
 use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
 use slabcast_scene::path::{Orientation, Turntable, ViewPath};
-use slabcast_scene::request::PathRequest;
+use slabcast_scene::request::{PathRequest, VolumeChoice};
 use slabcast_scene::transfer::TransferChoice;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Condvar, Mutex};
@@ -36,6 +38,7 @@ fn master_with(hooks: Hooks, heartbeat: Micros, shares: Shares) -> Master {
 fn request(key: &str, frames: u32, preset: &str) -> PathRequest {
     PathRequest {
         client_key: key.into(),
+        volume: VolumeChoice::Default,
         path: ViewPath::from_turntable(SIZE, Turntable { frames, ..Turntable::default() }),
         transfer: TransferChoice::Name(preset.into()),
         quality: Quality::before(),
@@ -388,14 +391,11 @@ fn counted(stage: Stage) -> (Hooks, Gate, Arc<AtomicUsize>) {
 async fn job_takes_memory_for_its_request_and_not_for_its_frames() {
     let master = master(Hooks::default(), 1_000_000);
     let handle = master.handle();
+    let open = handle.library().open(&VolumeChoice::Default, Viewer::own()).expect("it is there");
     let mut held = [0; 2];
     for (held, (key, frames)) in held.iter_mut().zip([("short", 1), ("long", 100_000)]) {
-        let plan = Plan::new(
-            request(key, frames, "grey"),
-            handle.volume(),
-            &Volume::from_fn_u8("v", [24; 3], |i, j, k| (i * 7 + j * 3 + k) as u8),
-            &Shares::default(),
-        );
+        let plan =
+            Plan::new(request(key, frames, "grey"), &open.served, &open.volume, &Shares::default());
         *held = plan.expect("a good request").held_bytes();
     }
     assert!(held[1] < 8192 && held[1].abs_diff(held[0]) < 16, "{held:?} bytes");
@@ -643,7 +643,11 @@ async fn job_whose_worker_refuses_tiles_says_that_and_not_that_others_come_first
 async fn name_of_the_file_is_told_to_this_machine_alone() {
     let master = master(Hooks::default(), 1_000_000);
     let handle = master.handle();
-    let name = |ip: Option<&str>| handle.name_for(ip.map(|ip| ip.parse().expect("an address")));
+    let digest = handle.library().default_volume().expect("it is there").info.digest;
+    let name = |ip: Option<&str>| {
+        let viewer = handle.viewer(ip.map(|ip| ip.parse().expect("an address")));
+        handle.library().name_of(digest, viewer)
+    };
     assert_eq!([name(None), name(Some("127.0.0.1")), name(Some("::ffff:127.0.0.1"))], ["v"; 3]);
     let other = name(Some("10.0.0.1"));
     assert!(other.starts_with("sha256:") && other.len() == 19, "{other}");

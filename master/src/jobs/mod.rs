@@ -25,6 +25,7 @@ use numbers::Numbers;
 use slabcast_common::ids::JobId;
 use slabcast_common::image::PixelFormat;
 use slabcast_common::stats::FrameStats;
+use slabcast_common::volume::Digest32;
 use slabcast_scene::path::Framing;
 use slabcast_scene::request::PathRequest;
 use std::collections::{BTreeMap, BTreeSet};
@@ -115,6 +116,8 @@ pub struct JobView {
     pub format: PixelFormat,
     /// Target and height that the path was given, if it asked for them.
     pub framing: Option<Framing>,
+    /// Digest of the volume that it draws.
+    pub volume: Digest32,
     /// Time of submission, in milliseconds since 1970 UTC.
     pub submitted_unix_ms: i64,
     /// Time at which the job ended, in milliseconds since 1970 UTC; 0 before.

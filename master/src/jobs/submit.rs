@@ -7,14 +7,15 @@
 
 use super::active::ActiveJob;
 use super::{Job, JobState, JobView};
-use crate::handle::{ServedVolume, unix_ms};
+use crate::handle::unix_ms;
+use crate::library::{ServedVolume, VolumeError};
 use crate::memory::Shares;
 use slabcast_common::ids::{JobId, SceneId};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{InvalidField, Quality};
 use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
-use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
 use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_scene::path::{Framing, Prepared, ViewPath};
 use slabcast_scene::presets;
@@ -38,6 +39,9 @@ pub enum SubmitError {
     /// A field of the request can't be used.
     #[error(transparent)]
     Refused(#[from] InvalidField),
+    /// The volume is not there, or can't be read.
+    #[error(transparent)]
+    Volume(#[from] VolumeError),
     /// The client's key belongs to another request.
     #[error("client_key: belongs to another request; choose a fresh key")]
     KeyTaken,
@@ -62,6 +66,7 @@ pub(crate) struct Plan {
     tween: Option<Tween>,
     views: Views,
     framing: Option<Framing>,
+    volume: VolumeInfo,
 }
 
 /// The views of a path, each made when it is asked for.
@@ -121,7 +126,7 @@ pub(crate) fn check_key(key: &str) -> Result<(), InvalidField> {
 }
 
 impl Plan {
-    /// Checks `request` against the volume that is served and works out its views.
+    /// Checks `request` against its volume and works out its views.
     ///
     /// # Errors
     /// The field that can't be used.
@@ -162,7 +167,8 @@ impl Plan {
         let wanted =
             BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, &quality)?
                 .with_kept(request.work.keep);
-        Ok(Plan { request, wanted, transfer, quality, tween, views, framing })
+        let volume = info.clone();
+        Ok(Plan { request, wanted, transfer, quality, tween, views, framing, volume })
     }
 
     /// The job as the table shows it.
@@ -183,6 +189,7 @@ impl Plan {
                 size: request.path.size,
                 format: request.format,
                 framing: self.framing,
+                volume: self.volume.digest,
                 submitted_unix_ms: unix_ms(),
                 finished_unix_ms: 0,
             },
@@ -205,11 +212,16 @@ impl Plan {
     }
 
     /// The job as the driver renders it, from bricks with the needs `bricks`.
-    pub(crate) fn activate(self, id: JobId, volume: VolumeInfo, bricks: BrickNeeds) -> ActiveJob {
-        let Plan { request, wanted, transfer, quality, tween, views, framing: _ } = self;
+    pub(crate) fn activate(self, id: JobId, bricks: BrickNeeds) -> ActiveJob {
+        let Plan { request, wanted, transfer, quality, tween, views, framing: _, volume } = self;
         let (crop, key) = (wanted.crop, bricks.set_key(volume.digest));
         let scene = SceneSpec { id: SceneId(id.0), volume, transfer, quality, crop, bricks: key };
         ActiveJob { request, scene: Arc::new(scene), tween, bricks, views, next: 0, begun: 0 }
+    }
+
+    /// Digest of the volume.
+    pub(crate) fn volume(&self) -> Digest32 {
+        self.volume.digest
     }
 
     /// The sums that frames are drawn with.

@@ -6,6 +6,7 @@ use crate::driver::Event;
 use slabcast_common::image::Background;
 use slabcast_common::quality::{Quality, Work};
 use slabcast_scene::path::{Turntable, ViewPath};
+use slabcast_scene::request::VolumeChoice;
 use slabcast_scene::transfer::TransferChoice;
 use std::time::Duration;
 use tokio::sync::mpsc;
@@ -53,6 +54,7 @@ fn job(id: JobId, frames: u64) -> Job {
     let client_key = format!("key {id}");
     let request = PathRequest {
         client_key: client_key.clone(),
+        volume: VolumeChoice::Default,
         path: ViewPath::from_turntable([1, 1], Turntable::default()),
         transfer: TransferChoice::Name("auto".into()),
         quality: Quality::before(),
@@ -76,6 +78,7 @@ fn job(id: JobId, frames: u64) -> Job {
         size: [1, 1],
         format: PixelFormat::Rgb8,
         framing: None,
+        volume: Digest32::default(),
         submitted_unix_ms: 0,
         finished_unix_ms: 0,
     };

@@ -13,7 +13,7 @@ use tokio::time::Instant;
 #[derive(Clone, Debug)]
 pub enum WatchItem {
     /// The job changed; also sent before the first frame.
-    Notice(JobView),
+    Notice(Box<JobView>),
     /// The next frame, in order.
     Frame(Arc<FinishedFrame>),
     /// The next frame failed; others come after it.
@@ -207,7 +207,7 @@ impl Watch {
                     || job.retired
                 {
                     self.is_over = true;
-                    return Some(WatchItem::Notice(view.clone()));
+                    return Some(WatchItem::Notice(Box::new(view.clone())));
                 }
                 let news = News::new(view);
                 let is_new = self.last_notice.as_ref().is_none_or(|last| {
@@ -216,7 +216,7 @@ impl Watch {
                 if is_new {
                     self.last_notice = Some(news);
                     self.quiet_until = Some(Instant::now() + TILE_NEWS);
-                    return Some(WatchItem::Notice(view.clone()));
+                    return Some(WatchItem::Notice(Box::new(view.clone())));
                 }
                 // A notice ends the call and the wait, so that the next call begins to wait anew.
                 self.waits_for.is_none() && {

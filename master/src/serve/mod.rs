@@ -10,6 +10,7 @@ mod connections;
 mod gate;
 mod peers;
 mod render;
+mod volumes;
 
 pub use peers::PeerLimits;
 pub(crate) use peers::counted_as;

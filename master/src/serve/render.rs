@@ -2,7 +2,9 @@
 
 use super::Responses;
 use super::peers::Counts;
+use super::volumes::{self, volume_status};
 use crate::jobs::{JobState, JobView, Watch, WatchItem};
+use crate::library::{Library, Viewer};
 use crate::{Handle, SubmitError};
 use slabcast_common::ids::JobId;
 use slabcast_proto::MAX_RENDER_MESSAGE;
@@ -51,6 +53,11 @@ impl Render {
             watchers: Arc::new(Semaphore::new(MAX_WATCHERS)),
             of_peers: Arc::default(),
         }
+    }
+
+    /// Who makes a request, as the library knows callers.
+    fn viewer<T>(&self, request: &Request<T>) -> Viewer {
+        self.handle.viewer(request.remote_addr().map(|address| address.ip()))
     }
 
     /// The job with an id, or NOT_FOUND.
@@ -112,7 +119,7 @@ pub fn notice(job: &JobView) -> JobNotice {
     }
 }
 
-fn job_to_wire(view: &JobView) -> wire::Job {
+fn job_to_wire(view: &JobView, library: &Library, viewer: Viewer) -> wire::Job {
     let (state, message) = state(&view.state);
     convert::job_to_wire(&model::Job {
         job_id: view.id.to_string(),
@@ -126,6 +133,7 @@ fn job_to_wire(view: &JobView) -> wire::Job {
         format: view.format,
         submitted_unix_ms: view.submitted_unix_ms,
         finished_unix_ms: view.finished_unix_ms,
+        volume: Some((view.volume, library.name_of(view.volume, viewer))),
     })
 }
 
@@ -168,6 +176,7 @@ impl RenderService for Render {
             Err(SubmitError::Refused(wrong)) => {
                 Err(invalid_field(&convert::wire_field(&wrong.field, &path), &wrong.problem))
             }
+            Err(SubmitError::Volume(e)) => Err(volume_status(&e)),
             Err(SubmitError::KeyTaken) => {
                 let message = "client_key: belongs to another request; choose a fresh key";
                 Err(Reason::ClientKeyTaken.status(message, &[]))
@@ -224,19 +233,24 @@ impl RenderService for Render {
         &self,
         request: Request<wire::GetJobRequest>,
     ) -> Result<Response<wire::GetJobResponse>, Status> {
+        let viewer = self.viewer(&request);
         let (_, view) = self.job(&request.into_inner().job_id)?;
-        Ok(Response::new(wire::GetJobResponse { job: Some(job_to_wire(&view)) }))
+        let job = job_to_wire(&view, self.handle.library(), viewer);
+        Ok(Response::new(wire::GetJobResponse { job: Some(job) }))
     }
 
     async fn list_jobs(
         &self,
         request: Request<wire::ListJobsRequest>,
     ) -> Result<Response<wire::ListJobsResponse>, Status> {
+        let viewer = self.viewer(&request);
+        let library = self.handle.library();
         let wire::ListJobsRequest { page_size, page_token } = request.into_inner();
         let wanted = convert::page_from_wire(page_size, &page_token)?;
         let all = self.handle.jobs();
         let rest = all.iter().rev().filter(|job| wanted.after.is_none_or(|a| job.id.0 < a));
-        let (jobs, next_page_token) = page(wanted, rest.map(|job| (job.id.0, job_to_wire(job))));
+        let rest = rest.map(|job| (job.id.0, job_to_wire(job, library, viewer)));
+        let (jobs, next_page_token) = page(wanted, rest);
         Ok(Response::new(wire::ListJobsResponse { jobs, next_page_token }))
     }
 
@@ -244,6 +258,7 @@ impl RenderService for Render {
         &self,
         request: Request<wire::CancelJobRequest>,
     ) -> Result<Response<wire::CancelJobResponse>, Status> {
+        let viewer = self.viewer(&request);
         let peer = request.remote_addr().map(|address| address.ip().to_string());
         let job_id = request.into_inner().job_id;
         let (job, _) = self.job(&job_id)?;
@@ -251,24 +266,40 @@ impl RenderService for Render {
             info!(%job, peer, "job cancelled by a client");
         }
         let (_, view) = self.job(&job_id)?;
-        Ok(Response::new(wire::CancelJobResponse { job: Some(job_to_wire(&view)) }))
+        let job = job_to_wire(&view, self.handle.library(), viewer);
+        Ok(Response::new(wire::CancelJobResponse { job: Some(job) }))
     }
 
     async fn describe_volume(
         &self,
         request: Request<wire::DescribeVolumeRequest>,
     ) -> Result<Response<wire::DescribeVolumeResponse>, Status> {
-        let v = self.handle.volume();
-        Ok(Response::new(convert::volume_to_wire(&model::VolumeDescription {
-            name: self.handle.name_for(request.remote_addr().map(|address| address.ip())),
-            file_type: v.file_type.clone(),
-            anatomical: v.anatomical,
-            info: v.info.clone(),
-            orientation: v.orientation,
-            pixels_version: slabcast_common::PIXELS_VERSION,
-            protocol_version: slabcast_common::PROTOCOL_VERSION,
-            now_unix_ms: crate::handle::unix_ms(),
-        })))
+        let peer = request.remote_addr().map(|address| address.ip());
+        volumes::describe(&self.handle, request.into_inner(), peer).await.map(Response::new)
+    }
+
+    async fn list_volumes(
+        &self,
+        request: Request<wire::ListVolumesRequest>,
+    ) -> Result<Response<wire::ListVolumesResponse>, Status> {
+        let peer = request.remote_addr().map(|address| address.ip());
+        volumes::list(&self.handle, request.into_inner(), peer).await.map(Response::new)
+    }
+
+    async fn put_volume(
+        &self,
+        request: Request<wire::PutVolumeRequest>,
+    ) -> Result<Response<wire::PutVolumeResponse>, Status> {
+        let peer = request.remote_addr().map(|address| address.ip());
+        volumes::put(&self.handle, request.into_inner(), peer).await.map(Response::new)
+    }
+
+    async fn remove_volume(
+        &self,
+        request: Request<wire::RemoveVolumeRequest>,
+    ) -> Result<Response<wire::RemoveVolumeResponse>, Status> {
+        let peer = request.remote_addr().map(|address| address.ip());
+        volumes::remove(&self.handle, request.into_inner(), peer).await.map(Response::new)
     }
 
     async fn list_workers(
@@ -302,13 +333,13 @@ async fn send_frames(
         let item = tokio::select! {
             item = watch.next() => item,
             () = out.closed() => return Ok(()),
-            () = tokio::time::sleep(HEARTBEAT) => Some(WatchItem::Notice(view.clone())),
+            () = tokio::time::sleep(HEARTBEAT) => Some(WatchItem::Notice(Box::new(view.clone()))),
         };
         match item {
             None => break,
             Some(WatchItem::Notice(news)) => {
                 out.send(Ok(convert::notice_to_wire(&notice(&news)))).await.map_err(gone)?;
-                view = news;
+                view = *news;
             }
             Some(WatchItem::Failed { number, reason }) => {
                 next = number + 1;

@@ -14,8 +14,8 @@
 //!   [`Down::Bricks`], [`bricks_from_wire`].
 //! - **WatchFrames**, down: [`frame_to_wire`], [`frame_failed_to_wire`], [`notice_to_wire`],
 //!   [`watch_from_wire`].
-//! - Other calls of clients, up: [`submit_to_wire`], [`submit_from_wire`]; down: `job_...`,
-//!   `volume_...`, `worker_...`.
+//! - Other calls of clients, up: [`submit_to_wire`], [`submit_from_wire`], [`upload_to_wire`],
+//!   [`upload_from_wire`]; down: `job_...`, `volume_...`, `worker_...`.
 
 mod cluster;
 mod error;
@@ -32,10 +32,12 @@ pub use cluster::{
 pub use error::WireError;
 pub use fields::{local_field, wire_field};
 pub use render::{
-    Page, StatisticsPart, StatisticsParts, frame_failed_to_wire, frame_to_wire, framing_from_wire,
-    framing_to_wire, job_from_wire, job_to_wire, notice_to_wire, page_from_wire, page_token,
-    submit_from_wire, submit_to_wire, volume_from_wire, volume_to_wire, watch_from_wire,
-    worker_from_wire, worker_to_wire,
+    MAX_UPLOAD_CHUNK, Page, StatisticsPart, StatisticsParts, frame_failed_to_wire, frame_to_wire,
+    framing_from_wire, framing_to_wire, job_from_wire, job_to_wire, notice_to_wire, page_from_wire,
+    page_token, submit_from_wire, submit_to_wire, upload_from_wire, upload_to_wire,
+    volume_choice_from_wire, volume_choice_to_wire, volume_from_wire, volume_header_from_wire,
+    volume_header_to_wire, volume_list_from_wire, volume_list_to_wire, volume_to_wire,
+    watch_from_wire, worker_from_wire, worker_to_wire,
 };
 
 use slabcast_common::volume::Digest32;

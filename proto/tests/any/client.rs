@@ -7,13 +7,13 @@ use slabcast_common::ids::WorkerId;
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::quality::{Borders, Keep, Schedule, Sums, Work};
 use slabcast_common::stats::*;
-use slabcast_common::volume::{ValueCore, ValueSummary, VolumeInfo};
+use slabcast_common::volume::{Digest32, ValueCore, ValueSummary, VolumeInfo};
 use slabcast_proto::model;
 use slabcast_scene::path::{
     Axis, Crop, CropUnit, Easing, Fit, FlyThrough, Key, KeyFrames, Orientation, PathView,
     ProjectionKind, Side, Turntable, ViewPath,
 };
-use slabcast_scene::request::PathRequest;
+use slabcast_scene::request::{PathRequest, VolumeChoice};
 use slabcast_scene::transfer::TransferChoice;
 use std::time::Duration;
 
@@ -182,13 +182,17 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
     ];
     let sums = prop_oneof![Just(Sums::Auto), Just(Sums::I32), Just(Sums::F32)];
     (
-        ("[A-Za-z0-9-]{1,60}", path, transfer, quality(sums)),
+        (("[A-Za-z0-9-]{1,60}", volume_choice()), path, transfer, quality(sums)),
         (work, format(), background, any::<[bool; 2]>()),
     )
         .prop_map(
-            |((client_key, path, transfer, quality), (work, format, background, [trace, hash]))| {
+            |(
+                ((client_key, volume), path, transfer, quality),
+                (work, format, background, [trace, hash]),
+            )| {
                 PathRequest {
                     client_key,
+                    volume,
                     path,
                     transfer,
                     quality,
@@ -200,6 +204,14 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
                 }
             },
         )
+}
+
+fn volume_choice() -> impl Strategy<Value = VolumeChoice> {
+    prop_oneof![
+        Just(VolumeChoice::Default),
+        "[a-z0-9._-]{1,40}".prop_map(VolumeChoice::Name),
+        any::<[u8; 32]>().prop_map(|bytes| VolumeChoice::Digest(Digest32(bytes))),
+    ]
 }
 
 fn state() -> impl Strategy<Value = model::JobState> {
@@ -249,6 +261,7 @@ pub fn job() -> impl Strategy<Value = model::Job> {
             format,
             submitted_unix_ms: times[0],
             finished_unix_ms: times[1],
+            volume: Some((Digest32([n.frames_done as u8; 32]), "head.nii.gz".into())),
         })
 }
 

@@ -47,7 +47,7 @@ async fn told(run: &mut Run, volume: Arc<Volume>, orientation: Orientation) -> B
     let crew = WorkerGroup::new(1, None).expect("a crew");
     let cluster = Cluster::start(volume, orientation, crew, None).expect("a cluster");
     let handle = cluster.handle();
-    let message = run.request(&handle.volume().info);
+    let message = run.request(&cluster.volume().info);
     let mut source = embedded::submit(&handle, &run.request, message).await.expect("a job");
     loop {
         match source.updates.recv().await.expect("a frame").expect("no trouble") {

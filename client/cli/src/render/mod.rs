@@ -16,6 +16,7 @@ use run::Run;
 use slabcast_client::{Client, VolumeDescription};
 use slabcast_common::volume::Volume;
 use slabcast_scene::path::Orientation;
+use slabcast_scene::request::VolumeChoice;
 use slabcast_session::embedded::{self, Cluster, WorkerGroup};
 use slabcast_session::fail::Fail;
 use slabcast_session::output::{DiskWait, Format, Lines, Output, OutputArgs};
@@ -34,8 +35,9 @@ const SHORT_EXAMPLES: &str = "\
 Examples, and the flags of raw files, kernels, sums, slabs and tiles: slabcast help render";
 
 const EXAMPLES: &str = "\
-With VOLUME, a master and workers are started inside this process; with --master, a cluster
-renders the volume that its master serves. Both give the same bytes.
+Without --master, a master and workers are started inside this process; with it, a cluster renders. Both
+give the same bytes. VOLUME is then a file, which is put on the master unless it has it, or the name of
+a volume there (`slabcast volumes`).
 
 Examples:
   A turn about a head, 18 frames in slabcast-out/:
@@ -50,7 +52,7 @@ Examples:
       slabcast render brain.nii.gz --frames 72 -o - | ffmpeg -i - -pix_fmt yuv420p \\
           -colorspace bt709 -color_primaries bt709 -color_trc iec61966-2-1 turn.mp4
   On a cluster (see `slabcast master --help`):
-      slabcast render --master node1:7433 --tf vessels -o out/
+      slabcast render knee.nrrd --master node1:7433 --tf vessels -o out/
 
 To try it without a file, give a volume by formula: formula:spheres, formula:marker, formula:blob.
 A path file looks like this:
@@ -121,14 +123,8 @@ pub(crate) struct RenderArgs {
 /// Runs the command.
 pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     let master = match (&args.volume, &args.master) {
-        (Some(_), Some(_)) => {
-            return Err(Fail::usage(
-                "VOLUME, --master: a master renders the volume that it serves; leave one of the two \
-                 out",
-            ));
-        }
+        (_, Some(master)) => Some(master.clone()),
         (Some(_), None) => None,
-        (None, Some(master)) => Some(master.clone()),
         (None, None) => {
             return Err(Fail::usage(
                 "VOLUME: nothing to render; give a file (or formula:spheres), or --master \
@@ -143,10 +139,10 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
                  master`",
             ));
         }
-        if !args.input.is_empty() {
+        if !args.input.is_empty() && !args.volume.as_deref().is_some_and(is_here) {
             return Err(Fail::usage(
-                "--dims, --type and the like say what is in a file, and with --master the master \
-                 has read it; leave them out",
+                "--dims, --type and the like say what is in a file, and the master has read the \
+                 volume; leave them out, or give a file",
             ));
         }
         for (given, flag) in [(args.workers, "workers"), (args.threads, "threads")] {
@@ -200,10 +196,9 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         notes: stays.into_iter().collect(),
         tell: true,
     };
-    let runtime =
-        if args.volume.is_some() { runtime::start_embedded()? } else { runtime::start()? };
+    let runtime = if master.is_none() { runtime::start_embedded()? } else { runtime::start()? };
     let result = match (&args.volume, master) {
-        (Some(file), _) => {
+        (Some(file), None) => {
             let mut run = run;
             run.progress.phase(&format!("reading {}", file.display()));
             let volume = Arc::new(args.input.open(file)?);
@@ -220,11 +215,11 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
                 Some(show) => runtime.block_on(drawn(run, volume, orientation, show, crew)),
             }
         }
-        (None, Some(master)) => {
+        (_, Some(master)) => {
             let mut run = run;
             run.progress.phase(&format!("dialling {master}"));
             let client = runtime.block_on(remote::connect(&master))?;
-            let served = runtime.block_on(remote::describe(&client))?;
+            let served = served(args, &mut run, &client, &runtime)?;
             if !run.request.target.is_empty() {
                 choose_there(&mut run, &client, &served, &master, &runtime, args.quiet)?;
             }
@@ -234,6 +229,51 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     };
     runtime::end(runtime);
     result
+}
+
+/// Whether VOLUME is a file, a folder or a formula here, and not the name of a volume at the master.
+fn is_here(volume: &Path) -> bool {
+    volume.exists() || volume.to_string_lossy().starts_with("formula:")
+}
+
+/// Returns the volume at the master that the command means. A file is read here, and put there unless
+/// the master has it.
+fn served(
+    args: &RenderArgs,
+    run: &mut Run,
+    client: &Client,
+    runtime: &tokio::runtime::Runtime,
+) -> Result<VolumeDescription, Fail> {
+    let Some(volume) = &args.volume else {
+        return runtime.block_on(remote::describe(client, &VolumeChoice::Default));
+    };
+    if !is_here(volume) {
+        let name = volume.to_string_lossy().into_owned();
+        return runtime.block_on(remote::describe(client, &VolumeChoice::Name(name)));
+    }
+    run.progress.phase(&format!("reading {}", volume.display()));
+    let volume = args.input.open(volume)?;
+    let orientation = args.scene.view.axes.for_volume(&volume)?;
+    let name = (volume.name.as_str(), false);
+    // Of what the master has, not a byte is sent and nothing said.
+    let mut sending = None;
+    let told = |there, total| {
+        if there < total || sending.is_some() {
+            let bar = sending.get_or_insert_with(|| Progress::new(args.quiet).counting("MiB"));
+            bar.uploaded(there, total, &format!("{} to {}", volume.name, client.address()));
+        }
+    };
+    let put = runtime.block_on(async {
+        signals::listen();
+        tokio::select! {
+            put = remote::put(client, &volume, orientation, name, told) => put,
+            code = signals::stopped() => Err(Fail::silent(code)),
+        }
+    });
+    if let Some(bar) = sending {
+        bar.end();
+    }
+    put
 }
 
 /// Renders the request of a picture's provenance in this process. Prints nothing at the end.
@@ -278,7 +318,7 @@ async fn embedded(
         None => Cluster::start(volume, orientation, crew, recorder)?,
     };
     let handle = cluster.handle();
-    let info = handle.volume().info.clone();
+    let info = cluster.volume().info.clone();
     let recipe = run.ready(&info, orientation, anatomical)?;
     let message = run.request(&info);
     let source = embedded::submit(&handle, &run.request, message).await?;
@@ -368,7 +408,7 @@ async fn cluster(
     let recipe = run.ready(&served.info, served.orientation, served.anatomical)?;
     let message = run.request(&served.info);
     let source = tokio::select! {
-        source = remote::submit(client, &run.request, message, served.info.digest) => source?,
+        source = remote::submit(client, &run.request, message) => source?,
         code = signals::stopped() => return Err(Fail::silent(code)),
     };
     let what = format!("{} on the cluster of {master}", served.name);

@@ -105,7 +105,7 @@ impl ClusterRun<'_> {
             let mut source = match &self.connection {
                 Connection::Embedded(handle) => embedded::submit(handle, &request, message).await?,
                 Connection::Remote(client) => {
-                    remote::submit((*client).clone(), &request, message, self.info.digest).await?
+                    remote::submit((*client).clone(), &request, message).await?
                 }
             };
             let received = receive(&mut source, written).await;

@@ -11,7 +11,7 @@ use slabcast_master::jobs::{FinishedFrame, JobState, WatchItem};
 use slabcast_master::{Handle, Master, MasterConfig};
 use slabcast_render::Simd;
 use slabcast_scene::path::{Orientation, ViewPath};
-use slabcast_scene::request::PathRequest;
+use slabcast_scene::request::{PathRequest, VolumeChoice};
 use slabcast_scene::transfer::TransferChoice;
 use slabcast_session::embedded::{Cluster, WorkerGroup, start_master};
 use slabcast_session::fail::Fail;
@@ -32,6 +32,7 @@ pub(super) fn request(
 ) -> PathRequest {
     PathRequest {
         client_key: slabcast_session::request::client_key(),
+        volume: VolumeChoice::Default,
         path,
         transfer: TransferChoice::Function(Box::new(transfer.clone())),
         quality,

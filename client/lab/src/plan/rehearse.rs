@@ -11,7 +11,7 @@ use slabcast_client::{Client, Update};
 use slabcast_common::ids::FrameId;
 use slabcast_common::image::{FrameState, PixelEncoding};
 use slabcast_common::stats::FrameStats;
-use slabcast_scene::request::PathRequest;
+use slabcast_scene::request::{PathRequest, VolumeChoice};
 use slabcast_schedule::{FrameJob, Spans};
 use slabcast_session::fail::Fail;
 use slabcast_session::progress::Progress;
@@ -226,7 +226,7 @@ impl Rehearsals<'_> {
             }
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
-        let served = remote::describe(&client).await?;
+        let served = remote::describe(&client, &VolumeChoice::Default).await?;
         let paths = LEAST_FRAMES.div_ceil(self.jobs.len().max(1));
         let requests: Vec<PathRequest> = (0..paths)
             .map(|_| {

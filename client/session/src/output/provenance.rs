@@ -215,6 +215,7 @@ impl RunProvenance {
         // A field that is new must be thought about here: does it decide pixels?
         let PathRequest {
             client_key: _,
+            volume: _,
             path,
             transfer: _,
             quality,

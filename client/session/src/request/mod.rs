@@ -22,7 +22,7 @@ use slabcast_common::view::View;
 use slabcast_common::volume::VolumeInfo;
 use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_scene::path::{Orientation, ViewPath};
-use slabcast_scene::request::PathRequest;
+use slabcast_scene::request::{PathRequest, VolumeChoice};
 use slabcast_scene::tween::Tween;
 use std::path::PathBuf;
 
@@ -227,7 +227,7 @@ impl RenderRequest {
         Fail::usage(refused.to_string())
     }
 
-    /// Returns the message to a master, with a new client key, for a volume with these values.
+    /// Returns the message to a master, with a new client key, for the volume `info` and no other.
     pub fn to_message(
         &self,
         info: &VolumeInfo,
@@ -236,6 +236,7 @@ impl RenderRequest {
     ) -> PathRequest {
         PathRequest {
             client_key: client_key(),
+            volume: VolumeChoice::Digest(info.digest),
             path: self.path.clone(),
             transfer: self.transfer.choice(info),
             quality: self.quality,

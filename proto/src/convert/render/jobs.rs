@@ -5,9 +5,11 @@ use super::watch::{state_from_wire, state_to_wire};
 use super::wire;
 use crate::convert::numbers::size_from_wire;
 use crate::convert::{
-    MAX_NAME, WireError, name_from_wire, optional_name_from_wire, reason_from_wire, reason_to_wire,
+    MAX_NAME, WireError, digest_from_wire, name_from_wire, optional_name_from_wire,
+    reason_from_wire, reason_to_wire,
 };
 use crate::model::{Job, Worker};
+use bytes::Bytes;
 use prost_types::{Duration as WireDuration, Timestamp};
 use slabcast_common::ids::WorkerId;
 use std::time::Duration;
@@ -99,6 +101,11 @@ pub fn job_to_wire(job: &Job) -> wire::Job {
         format: format_to_wire(job.format),
         submit_time: time_to_wire(job.submitted_unix_ms),
         finish_time: time_to_wire(job.finished_unix_ms),
+        volume_digest: job
+            .volume
+            .as_ref()
+            .map_or_else(Bytes::new, |(digest, _)| Bytes::copy_from_slice(&digest.0)),
+        volume_name: job.volume.as_ref().map_or_else(String::new, |(_, name)| name.clone()),
     }
 }
 
@@ -119,6 +126,13 @@ pub fn job_from_wire(job: wire::Job) -> Result<Job, WireError> {
         format: format_from_wire("format", job.format)?,
         submitted_unix_ms: time_from_wire("submit_time", job.submit_time)?,
         finished_unix_ms: time_from_wire("finish_time", job.finish_time)?,
+        volume: match &job.volume_digest[..] {
+            [] => None,
+            digest => {
+                let name = reason_from_wire("volume_name", job.volume_name)?;
+                Some((digest_from_wire("volume_digest", digest)?, name))
+            }
+        },
     })
 }
 

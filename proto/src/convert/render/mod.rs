@@ -15,7 +15,11 @@ pub use jobs::{
 pub use path::{framing_from_wire, framing_to_wire};
 pub use statistics::{StatisticsPart, StatisticsParts};
 pub use submit::{submit_from_wire, submit_to_wire};
-pub use volume::{volume_from_wire, volume_to_wire};
+pub use volume::{
+    MAX_UPLOAD_CHUNK, upload_from_wire, upload_to_wire, volume_choice_from_wire,
+    volume_choice_to_wire, volume_from_wire, volume_header_from_wire, volume_header_to_wire,
+    volume_list_from_wire, volume_list_to_wire, volume_to_wire,
+};
 pub use watch::{frame_failed_to_wire, frame_to_wire, notice_to_wire, watch_from_wire};
 
 use super::{WireError, enum_conversions};

@@ -5,6 +5,7 @@ use super::shared::{
     background_from_wire, background_to_wire, quality_from_wire, quality_to_wire,
     transfer_from_wire, transfer_to_wire,
 };
+use super::volume::{volume_choice_from_wire, volume_choice_to_wire};
 use super::{enum_conversions, wire};
 use crate::convert::{WireError, name_from_wire, required};
 use slabcast_common::image::PixelFormat;
@@ -45,6 +46,7 @@ pub fn submit_to_wire(request: &PathRequest) -> wire::SubmitPathRequest {
         background: Some(background_to_wire(request.background)),
         want_trace: request.want_trace,
         without_hash: !request.want_hash,
+        volume: volume_choice_to_wire(&request.volume),
     }
 }
 
@@ -56,6 +58,7 @@ pub fn submit_to_wire(request: &PathRequest) -> wire::SubmitPathRequest {
 pub fn submit_from_wire(request: wire::SubmitPathRequest) -> Result<PathRequest, WireError> {
     Ok(PathRequest {
         client_key: name_from_wire("client_key", request.client_key)?,
+        volume: volume_choice_from_wire(request.volume)?,
         path: path_from_wire(required("path", request.path)?).map_err(|e| e.within("path"))?,
         transfer: choice_from_wire(request.transfer.unwrap_or_default())
             .map_err(|e| e.within("transfer"))?

@@ -9,13 +9,14 @@ mod proxy;
 
 use proxy::{Noise, Place, Proxy, Swallows};
 use sha2::{Digest, Sha256};
-use slabcast_client::{Client, ClientError, PATIENCE, Update};
+use slabcast_client::{Client, ClientError, PATIENCE, Update, VolumeHeader};
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::message::{Hello, ToMaster, ToWorker};
 use slabcast_common::protocol::PROTOCOL_VERSIONS;
 use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_master::jobs::WatchItem;
-use slabcast_master::{Handle, Master, MasterConfig};
+use slabcast_master::library::{UploadConfig, Viewer};
+use slabcast_master::{Handle, Library, LibraryConfig, Master, MasterConfig};
 use slabcast_proto::cluster_v1::BricksResponse;
 use slabcast_proto::cluster_v1::cluster_service_client::ClusterServiceClient;
 use slabcast_proto::{convert, sealed};
@@ -348,6 +349,47 @@ async fn flipped_bits_between_a_client_and_its_master_change_no_picture() {
 async fn a_hundred_thousand_flips_each_way_change_no_picture_of_a_client() {
     let flips = std::env::var("SLABCAST_FLIPS").map_or(100_000, |n| n.parse().expect("a number"));
     watched(5, flips, 3).await;
+}
+
+/// A volume of 2 MiB crosses a line that damages a third of all frames.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn volume_that_is_put_over_a_noisy_line_arrives_whole() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let axes = Orientation::new(None, None).expect("the defaults");
+    let uploads = UploadConfig { folder: dir.path().into(), quota_bytes: 1 << 30 };
+    let library = Library::new(LibraryConfig {
+        given: None,
+        folder: None,
+        uploads: Some(uploads),
+        memory_bytes: 1 << 30,
+        read: Arc::new(|_, _| unreachable!("it has no folder")),
+    });
+    let config = MasterConfig::of(library.expect("a library"));
+    let master = Master::start(config).expect("a master");
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = listener.local_addr().expect("it has one").to_string();
+    let (stop, stopped) = watch::channel(false);
+    tokio::spawn(slabcast_master::serve::serve(master.handle(), listener, stopped));
+    let noise = [8, 9].map(|seed| Noise::new(seed, 3, u64::MAX, Place::Messages));
+    let [up, down] = noise.clone();
+    let proxy = Proxy::start(address, (up, down), NONE).await;
+    let volume = slabcast_volumes::open("formula:spheres:128".as_ref()).expect("a formula");
+    let header = VolumeHeader {
+        name: "noisy".into(),
+        file_type: volume.file_type.clone(),
+        info: volume.info(volume.digest()),
+        orientation: axes,
+    };
+    let put = tokio::time::timeout(PATIENT, async {
+        let client = Client::connect(&proxy.address).await.expect("it listens");
+        client.put_volume(&header, &volume.samples, |_| {}).await.expect("there in the end");
+    });
+    put.await.expect("no hang");
+    assert!(noise[0].flips.load(Relaxed) > 5, "{:?}", noise[0]);
+    let choice = VolumeChoice::Digest(volume.digest());
+    let open = master.handle().library().open(&choice, Viewer::own()).expect("it is there");
+    assert_eq!(open.volume.samples, volume.samples);
+    stop.send_replace(true);
 }
 
 /// A client that closes its watches and drops its calls, many at a time, loses no other stream of its

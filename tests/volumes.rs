@@ -89,7 +89,8 @@ fn two_users_draw_two_volumes_of_one_master_at_a_time_as_they_would_alone() {
     let (code, said) = fails(dir, &[&["render", "-o", "x.png"], &there[..], &VIEW[..]].concat());
     assert_eq!(code, Some(2));
     assert!(said.contains("VOLUME: the master has 2 volumes; name one"), "{said}");
-    let (code, said) = fails(dir, &[&["render", "foot", "-o", "x.png"], &there[..], &VIEW[..]].concat());
+    let (code, said) =
+        fails(dir, &[&["render", "foot", "-o", "x.png"], &there[..], &VIEW[..]].concat());
     assert_eq!(code, Some(1));
     assert!(said.contains("no volume `foot` here; there are head.nii, knee.nrrd"), "{said}");
 }

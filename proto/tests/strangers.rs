@@ -35,6 +35,8 @@ fn all_doors(bytes: &[u8]) {
     door!(render_v1::Job, convert::job_from_wire);
     door!(render_v1::DescribeVolumeResponse, convert::volume_from_wire);
     door!(render_v1::Worker, convert::worker_from_wire);
+    door!(render_v1::ListVolumesResponse, convert::volume_list_from_wire);
+    door!(render_v1::PutVolumeRequest, convert::upload_from_wire);
 }
 
 /// Statistics are read when the last of them is there.
@@ -120,6 +122,16 @@ proptest! {
         let pixels = vec![1; 3].into();
         let frame = convert::frame_to_wire(0, [1, 1], PixelFormat::Rgb8, &pixels, &stats, "");
         all_doors(&spoil(frame[0].encode_to_vec(), &how));
+    }
+
+    #[test]
+    fn damaged_uploads_and_lists_never_panic(
+        upload in any::upload(), list in any::volume_list(),
+        how in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>(), any::<u8>()), 1..6),
+    ) {
+        all_doors(&spoil(convert::upload_to_wire(&upload).encode_to_vec(), &how));
+        let list = convert::volume_list_to_wire(&list, String::new());
+        all_doors(&spoil(list.encode_to_vec(), &how));
     }
 
     #[test]

@@ -109,6 +109,17 @@ proptest! {
         prop_assert_eq!(shown(&back), shown(&Ok::<_, ()>(volume)));
     }
 
+    #[test]
+    fn uploads_and_lists_of_volumes_arrive_unchanged(
+        upload in any::upload(), list in any::volume_list(),
+    ) {
+        let back = convert::upload_from_wire(wire(convert::upload_to_wire(&upload)));
+        prop_assert_eq!(shown(&back), shown(&Ok::<_, ()>(upload)));
+        let sent = convert::volume_list_to_wire(&list, "after-3".into());
+        let back = convert::volume_list_from_wire(wire(sent));
+        prop_assert_eq!(back, Ok((list, "after-3".to_owned())));
+    }
+
     /// Statistics cross as messages, and the JSON on the other side is the same to the byte.
     #[test]
     fn statistics_arrive_unchanged(stats in any::stats(), pixels in 1usize..99) {

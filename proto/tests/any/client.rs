@@ -7,7 +7,7 @@ use slabcast_common::ids::WorkerId;
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::quality::{Borders, Keep, Schedule, Sums, Work};
 use slabcast_common::stats::*;
-use slabcast_common::volume::{Digest32, ValueCore, ValueSummary, VolumeInfo};
+use slabcast_common::volume::{Digest32, SampleKind, ValueCore, ValueSummary, VolumeInfo};
 use slabcast_proto::model;
 use slabcast_scene::path::{
     Axis, Crop, CropUnit, Easing, Fit, FlyThrough, Key, KeyFrames, Orientation, PathView,
@@ -288,6 +288,41 @@ pub fn volume() -> impl Strategy<Value = model::VolumeDescription> {
             }
         },
     )
+}
+
+pub fn upload() -> impl Strategy<Value = model::UploadPart> {
+    let begin = ("[a-z0-9_-]{1,30}", volume()).prop_map(|(name, v)| {
+        model::UploadPart::Begin(Box::new(model::VolumeHeader {
+            name,
+            file_type: v.file_type,
+            info: v.info,
+            orientation: v.orientation,
+        }))
+    });
+    let chunk = (any::<[u8; 32]>(), any::<u64>(), vec(any::<u8>(), 0..99));
+    let chunk = chunk.prop_map(|(digest, offset, data)| model::UploadPart::Chunk {
+        digest: Digest32(digest),
+        offset,
+        data: data.into(),
+    });
+    prop_oneof![begin, chunk]
+}
+
+pub fn volume_list() -> impl Strategy<Value = model::VolumeList> {
+    let read = proptest::option::of((any::<[u8; 32]>(), any::<[u32; 3]>()))
+        .prop_map(|read| read.map(|(digest, dims)| (Digest32(digest), dims, SampleKind::U16)));
+    let origin = prop_oneof![
+        Just(model::VolumeOrigin::Given),
+        Just(model::VolumeOrigin::Folder),
+        Just(model::VolumeOrigin::Upload)
+    ];
+    let entry = ("\\PC{0,40}", read, any::<u64>(), origin, any::<bool>(), "\\PC{0,50}");
+    let entry = entry.prop_map(|(name, read, bytes, origin, in_memory, problem)| {
+        model::VolumeEntry { name, read, bytes, origin, in_memory, problem }
+    });
+    (vec(entry, 0..4), any::<[u32; 2]>(), time()).prop_map(|(volumes, [p, q], now_unix_ms)| {
+        model::VolumeList { volumes, pixels_version: p, protocol_version: q, now_unix_ms }
+    })
 }
 
 pub fn worker() -> impl Strategy<Value = model::Worker> {

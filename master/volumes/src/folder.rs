@@ -40,8 +40,10 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
         return tiff_stack::read_files(pictures, &name, &hints.raw, hints.cap());
     }
     // Suggest volume files that the user may have meant.
-    const ENDS: [&str; 9] =
-        [".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd", ".vti", ".raw", ".raw.gz"];
+    const ENDS: [&str; 18] = [
+        ".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd", ".vti", ".raw", ".raw.gz", ".hdr",
+        ".mgz", ".mgh", ".mrc", ".map", ".rec", ".npy", ".npz", ".vtk",
+    ];
     let mut volumes = files.iter().filter_map(|(path, _)| {
         let name = path.file_name()?.to_string_lossy().into_owned();
         ENDS.iter().any(|end| name.to_ascii_lowercase().ends_with(end)).then(|| quoted(&name))

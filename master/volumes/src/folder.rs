@@ -1,5 +1,4 @@
-//! Opens a folder: a Zarr array or pyramid, the slices of a DICOM series, or the pictures of a TIFF
-//! stack. For any other folder the error names a volume file in it.
+//! Opens a folder: a Zarr array or pyramid, the slices of a DICOM series, or the pictures of a stack. For any other folder the error names a volume file in it.
 
 #[cfg(feature = "dicom")]
 use crate::dicom;
@@ -7,7 +6,7 @@ use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::source::{Folder, Inside};
 #[cfg(feature = "zarr")]
 use crate::zarr;
-use crate::{Hints, Opened, tiff_stack};
+use crate::{Hints, Opened, pictures, tiff_stack};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -35,9 +34,20 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
             return dicom::open(&slices, folder, hints, None);
         }
     }
-    let pictures = matching(tiff_stack::sniff);
-    if !pictures.is_empty() {
-        return tiff_stack::read_files(pictures, &name, &hints.raw, hints.cap());
+    let tiffs = matching(tiff_stack::sniff);
+    if !tiffs.is_empty() {
+        return tiff_stack::read_files(tiffs, &name, &hints.raw, hints.cap());
+    }
+    let (png, jpeg) = (matching(pictures::is_png), matching(pictures::is_jpeg));
+    if !png.is_empty() || !jpeg.is_empty() {
+        let (chosen, left_out) = if png.is_empty() { (jpeg, 0) } else { (png, jpeg.len()) };
+        let mut opened = pictures::read_files(chosen, &name, &hints.raw, hints.cap())?;
+        if left_out > 0 {
+            opened
+                .notes
+                .push(format!("{left_out} JPEG pictures beside the PNG ones were not read"));
+        }
+        return Ok(opened);
     }
     // Suggest volume files that the user may have meant.
     const ENDS: [&str; 18] = [

@@ -519,6 +519,26 @@ fn legacy_vtk_mutants_neither_panic_nor_hang_nor_fill_memory() {
     survive_plain("vtk", &seeds);
 }
 
+#[test]
+fn png_and_jpeg_mutants_neither_panic_nor_hang_nor_fill_memory() {
+    use crate::pictures::tests::{jpeg, png};
+    use png::{BitDepth, ColorType};
+    let rows: Vec<u8> = (0..96).map(|i| i * 2).collect();
+    let seeds = [
+        png((8, 6), (ColorType::Grayscale, BitDepth::Eight), None, &rows[..48]),
+        png((8, 6), (ColorType::Grayscale, BitDepth::Sixteen), None, &rows),
+        png((8, 6), (ColorType::Indexed, BitDepth::Four), Some(&[9; 48]), &rows[..24]),
+        jpeg(false),
+        jpeg(true),
+    ];
+    survive(
+        "pictures",
+        mutants(),
+        |rng| seed_or_mutant(rng, &seeds),
+        |bytes| crate::pictures::one_picture(Source::from_bytes(bytes)).map(|_| None),
+    );
+}
+
 /// Mutates the headers; the samples beside them stay as they are.
 #[test]
 fn pair_mutants_neither_panic_nor_hang_nor_fill_memory() {

@@ -25,7 +25,7 @@
 //! - NIfTI-1 and NIfTI-2 in one file, and pairs of NIfTI and ANALYZE 7.5: `.nii`, `.hdr` with `.img`
 //! - FreeSurfer's `.mgh` and `.mgz`, MRC and CCP4 maps, NumPy's `.npy` and `.npz`
 //! - VTK image data in XML: `.vti`; legacy structured points: `.vtk`
-//! - TIFF: the pages of one file, or a folder of single pages
+//! - TIFF: the pages of one file, or a folder of single pages; PNG and JPEG: a folder of them
 //! - raw numbers, with size and type from flags or from the file's name
 //! - DICOM series, one folder of slices (feature `dicom`)
 //! - Zarr arrays of versions 2 and 3, and OME-Zarr pyramids (feature `zarr`)
@@ -60,6 +60,7 @@ mod npy;
 mod nrrd;
 #[cfg(test)]
 mod phantom;
+mod pictures;
 mod plain;
 mod prefilter;
 mod raw;

@@ -64,8 +64,16 @@ pub(super) enum Pixels {
         /// Whether they are words of 16 bits (VR OW), whose bytes the byte order turns.
         words: bool,
     },
-    /// Run-length encoded, in fragments.
+    /// Encoded, in fragments.
+    Packed(Packing),
+}
+
+/// How pixels in fragments are encoded.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Packing {
+    /// Run lengths.
     Rle,
+    Jpeg,
 }
 
 /// A file read up to its pixels.
@@ -109,7 +117,7 @@ impl File {
             ElementReader { inner: Box::new(source.reader), consumed_bytes: 0, elements: 0 };
         let mut values = BTreeMap::new();
         let mut syntax = Syntax { explicit: false, endian: Endian::Little };
-        let (mut rle, mut deflated) = (false, false);
+        let (mut packing, mut deflated) = (None, false);
         if part10 {
             reader.skip(132)?;
             let meta = Syntax { explicit: true, endian: Endian::Little };
@@ -118,17 +126,21 @@ impl File {
                 reader.element(meta, &mut values, len)?;
             }
             let uid = values.get(&(0x0002, 0x0010)).map(|v| text(v)).unwrap_or_default();
-            (syntax, rle, deflated) = match uid.as_str() {
-                "1.2.840.10008.1.2" | "" => (syntax, false, false),
-                "1.2.840.10008.1.2.1" => (meta, false, false),
-                "1.2.840.10008.1.2.1.99" => (meta, false, true),
+            (syntax, packing, deflated) = match uid.as_str() {
+                "1.2.840.10008.1.2" | "" => (syntax, None, false),
+                "1.2.840.10008.1.2.1" => (meta, None, false),
+                "1.2.840.10008.1.2.1.99" => (meta, None, true),
                 "1.2.840.10008.1.2.2" => {
-                    (Syntax { explicit: true, endian: Endian::Big }, false, false)
+                    (Syntax { explicit: true, endian: Endian::Big }, None, false)
                 }
-                "1.2.840.10008.1.2.5" => (meta, true, false),
+                "1.2.840.10008.1.2.5" => (meta, Some(Packing::Rle), false),
+                "1.2.840.10008.1.2.4.50"
+                | "1.2.840.10008.1.2.4.51"
+                | "1.2.840.10008.1.2.4.57"
+                | "1.2.840.10008.1.2.4.70" => (meta, Some(Packing::Jpeg), false),
                 other => {
                     let name = match other.strip_prefix("1.2.840.10008.1.2.4.") {
-                        Some("50" | "51" | "57" | "70") => "JPEG",
+                        Some("52" | "53" | "54" | "55" | "56") => "JPEG of a kind that is not used",
                         Some("80" | "81") => "JPEG-LS",
                         Some("90" | "91" | "92" | "93" | "201" | "202" | "203") => "JPEG 2000",
                         Some("100" | "101" | "102" | "103" | "104" | "105" | "106") => "video",
@@ -168,9 +180,9 @@ impl File {
                 break pixels;
             }
         };
-        let pixels = match (rle, bytes) {
-            (true, UNDEFINED) => Pixels::Rle,
-            (false, n) if n != UNDEFINED => {
+        let pixels = match (packing, bytes) {
+            (Some(packing), UNDEFINED) => Pixels::Packed(packing),
+            (None, n) if n != UNDEFINED => {
                 let left = len.saturating_sub(reader.consumed_bytes);
                 if u64::from(n) > left {
                     return Err(crate::samples::truncated(n.into(), left));

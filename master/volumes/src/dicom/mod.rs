@@ -7,6 +7,8 @@
 
 mod confine;
 mod elements;
+mod fragments;
+mod jpeg;
 mod rle;
 mod series;
 mod watch;
@@ -34,8 +36,9 @@ use wire::Preface;
 /// a network disk, and more than a process that only waits.
 const BYTES_A_SECOND: u64 = 4 << 20;
 
-/// Most bytes of samples per byte of a file: two bytes of RLE decode to at most 128.
-const RLE_RATIO: u64 = 64;
+/// Most bytes of samples per byte of a file: two bytes of RLE decode to at most 128, and a byte of JPEG
+/// to as many.
+const PACKED_RATIO: u64 = 128;
 
 /// Opens one series of these files, which are all DICOM and in `folder`. The hints name it, the
 /// command that parses, and the limit; `file` is a slice of it.
@@ -136,7 +139,7 @@ fn read_volume(
         preface;
     let layout = Layout::new(lattice.dims.map(u64::from), number, Endian::Little, "slices")?;
     lattice.check().map_err(|e| Problem::malformed("slices", e, "get the series again"))?;
-    let supply = Supply::Encoded { name: "DICOM", bytes, ratio: RLE_RATIO };
+    let supply = Supply::Encoded { name: "DICOM", bytes, ratio: PACKED_RATIO };
     let (samples, stored) = samples::read(pipe, supply, &layout, cap).map_err(|mut p| {
         p.field = "slices".into();
         p

@@ -1,9 +1,9 @@
 //! Groups the files of a folder into series, sorts the slices of one, places them and writes its
 //! samples.
 
-use super::elements::{File, Pixels, Tag};
-use super::rle;
+use super::elements::{File, Packing, Pixels, Tag};
 use super::wire::Preface;
+use super::{fragments, jpeg, rle};
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::samples::{DIM_MAX, Endian, Layout, Number};
 use crate::source::Source;
@@ -356,7 +356,7 @@ impl Slice {
         let instance = file.numbers::<1>((0x0020, 0x0013)).ok().flatten().map_or(0.0, |[n]| n);
         let native_bytes = match file.pixels {
             Pixels::Native { bytes, .. } => Some(bytes),
-            Pixels::Rle => None,
+            Pixels::Packed(_) => None,
         };
         Ok(Slice {
             path: path.into(),
@@ -558,7 +558,12 @@ fn pixels_of(slice: &Slice, mut file: File, len: u64, number: Number) -> Result<
     let size = usize::from(format.allocated / 8);
     let count = usize::from(format.columns) * usize::from(format.rows);
     let bytes = match file.pixels {
-        Pixels::Rle => rle::unpack(&mut *file.rest, count, size)?,
+        Pixels::Packed(Packing::Rle) => rle::unpack(&mut *file.rest, count, size)?,
+        Pixels::Packed(Packing::Jpeg) => {
+            let most = jpeg::fragments_max_bytes(count * size);
+            let fragment = fragments::read(&mut *file.rest, most)?;
+            jpeg::unpack(&fragment, (format.columns, format.rows), size)?
+        }
         Pixels::Native { bytes: have, words } => {
             let need = (count * size) as u64;
             slice.padding_bytes()?;

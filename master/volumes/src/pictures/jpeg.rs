@@ -36,11 +36,11 @@ impl Jpeg {
             .take(FILE_MAX_BYTES)
             .read_to_end(&mut bytes)
             .map_err(|e| Problem::io("picture", &e))?;
-        let header = Header::new(&bytes)?;
+        let header = Frame::of_picture(&bytes)?;
         let shape =
             Shape { width: header.width.into(), height: header.height.into(), number: Number::U8 };
         // One byte a colour, and coefficients of two bytes if it is progressive.
-        let each = u64::from(header.components) * if header.progressive { 3 } else { 1 };
+        let each = u64::from(header.components) * if header.process == 2 { 3 } else { 1 };
         check_whole(each * u64::from(header.width) * u64::from(header.height), len)?;
         Ok(Jpeg { bytes, shape })
     }
@@ -56,7 +56,7 @@ impl Jpeg {
 
 /// Decodes a picture of 8 bits, and returns its pixels and the numbers in each: one or three.
 pub(crate) fn decode(bytes: &[u8]) -> Result<(Vec<u8>, usize), Problem> {
-    let header = Header::new(bytes)?;
+    let header = Frame::of_picture(bytes)?;
     // The decoder makes up what is missing.
     if !is_whole(bytes) {
         return Err(damaged("it has no end"));
@@ -116,16 +116,19 @@ pub(crate) fn is_whole(bytes: &[u8]) -> bool {
 
 /// What a frame's header says (SOF, section B.2.2 of ITU-T T.81).
 #[derive(Debug, PartialEq)]
-pub(crate) struct Header {
+pub(crate) struct Frame {
+    /// Number of the coding process: 0 baseline, 1 extended, 2 progressive, 3 lossless.
+    pub(crate) process: u8,
+    /// Bits of a number.
+    pub(crate) precision: u8,
     pub(crate) width: u16,
     pub(crate) height: u16,
     pub(crate) components: u8,
-    progressive: bool,
 }
 
-impl Header {
-    /// Finds the frame's header; fails for pictures that are not Huffman-coded with 8 bits.
-    pub(crate) fn new(bytes: &[u8]) -> Result<Header, Problem> {
+impl Frame {
+    /// Finds the first frame's header.
+    pub(crate) fn find(bytes: &[u8]) -> Result<Frame, Problem> {
         let mut at = 2;
         loop {
             let marker = bytes.get(at..at + 4).ok_or_else(|| damaged("no frame"))?;
@@ -137,34 +140,37 @@ impl Header {
                 at += if marker[1] == 0xff { 1 } else { 2 };
                 continue;
             }
-            let len = usize::from(u16::from_be_bytes([marker[2], marker[3]]));
             let frame =
                 matches!(marker[1], 0xc0..=0xcf) && !matches!(marker[1], 0xc4 | 0xc8 | 0xcc);
             if !frame {
-                at += 2 + len.max(2);
+                at += 2 + usize::from(u16::from_be_bytes([marker[2], marker[3]])).max(2);
                 continue;
             }
             let body = bytes.get(at + 4..at + 10).ok_or_else(|| damaged("no frame"))?;
-            let read = matches!(marker[1], 0xc0..=0xc2) && body[0] == 8;
-            if !(read && matches!(body[5], 1 | 3)) {
-                return Err(Problem::unsupported(
-                    "picture",
-                    format!(
-                        "is JPEG with {} bits, {} colours and process {}, which is not read",
-                        body[0],
-                        body[5],
-                        marker[1] - 0xc0
-                    ),
-                    "save it as PNG or TIFF",
-                ));
-            }
             let pair = |i: usize| u16::from_be_bytes([body[i], body[i + 1]]);
             let (height, width) = (pair(1), pair(3));
             if width == 0 || height == 0 {
                 return Err(damaged("a size of 0"));
             }
-            let progressive = marker[1] == 0xc2;
-            return Ok(Header { width, height, components: body[5], progressive });
+            let (precision, components) = (body[0], body[5]);
+            return Ok(Frame { process: marker[1] - 0xc0, precision, width, height, components });
+        }
+    }
+
+    /// Finds the header of a picture that [`decode`] takes: of 8 bits, Huffman-coded, with loss.
+    fn of_picture(bytes: &[u8]) -> Result<Frame, Problem> {
+        let frame = Frame::find(bytes)?;
+        let Frame { process, precision, components, .. } = frame;
+        match process <= 2 && precision == 8 && matches!(components, 1 | 3) {
+            true => Ok(frame),
+            false => Err(Problem::unsupported(
+                "picture",
+                format!(
+                    "is JPEG of {precision} bits, {components} colours and process {process}, which \
+                     is not read"
+                ),
+                "save it as PNG or TIFF",
+            )),
         }
     }
 }

@@ -5,7 +5,7 @@
 //! values are those that are stored: a PNG of one bit holds 0 and 1. Pictures have no spacing; it
 //! comes from `--spacing`.
 
-mod jpeg;
+pub(crate) mod jpeg;
 mod png;
 
 use crate::Opened;

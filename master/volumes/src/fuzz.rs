@@ -584,6 +584,18 @@ fn dicom_mutants_neither_panic_nor_hang_nor_fill_memory() {
     );
 }
 
+#[cfg(feature = "dicom")]
+#[test]
+fn jpeg_ls_mutants_neither_panic_nor_hang_nor_fill_memory() {
+    let seeds = crate::dicom::encoded_pictures();
+    survive(
+        "jpeg-ls",
+        mutants(),
+        |rng| seed_or_mutant(rng, &seeds),
+        |bytes| crate::dicom::one_jpeg_ls(&bytes).map(|_| None),
+    );
+}
+
 /// Runs a tenth of the number of mutants, since each writes files first.
 #[cfg(feature = "zarr")]
 #[test]

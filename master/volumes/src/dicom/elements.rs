@@ -74,6 +74,7 @@ pub(super) enum Packing {
     /// Run lengths.
     Rle,
     Jpeg,
+    JpegLs,
 }
 
 /// A file read up to its pixels.
@@ -138,10 +139,12 @@ impl File {
                 | "1.2.840.10008.1.2.4.51"
                 | "1.2.840.10008.1.2.4.57"
                 | "1.2.840.10008.1.2.4.70" => (meta, Some(Packing::Jpeg), false),
+                "1.2.840.10008.1.2.4.80" | "1.2.840.10008.1.2.4.81" => {
+                    (meta, Some(Packing::JpegLs), false)
+                }
                 other => {
                     let name = match other.strip_prefix("1.2.840.10008.1.2.4.") {
                         Some("52" | "53" | "54" | "55" | "56") => "JPEG of a kind that is not used",
-                        Some("80" | "81") => "JPEG-LS",
                         Some("90" | "91" | "92" | "93" | "201" | "202" | "203") => "JPEG 2000",
                         Some("100" | "101" | "102" | "103" | "104" | "105" | "106") => "video",
                         _ => "not an encoding that is known",

@@ -9,12 +9,15 @@ mod confine;
 mod elements;
 mod fragments;
 mod jpeg;
+mod jpeg_ls;
 mod rle;
 mod series;
 mod watch;
 mod wire;
 
 pub(crate) use elements::sniff;
+#[cfg(test)]
+pub(crate) use jpeg_ls::tests::{encoded_pictures, one_jpeg_ls};
 #[cfg(test)]
 pub(crate) use series::one_slice;
 
@@ -36,9 +39,9 @@ use wire::Preface;
 /// a network disk, and more than a process that only waits.
 const BYTES_A_SECOND: u64 = 4 << 20;
 
-/// Most bytes of samples per byte of a file: two bytes of RLE decode to at most 128, and a byte of JPEG
-/// to as many.
-const PACKED_RATIO: u64 = 128;
+/// Most bytes of samples per byte of a file: a row of 2048 numbers of 16 bits takes a bit in JPEG-LS, and
+/// a file has a header.
+const PACKED_RATIO: u64 = 8192;
 
 /// Opens one series of these files, which are all DICOM and in `folder`. The hints name it, the
 /// command that parses, and the limit; `file` is a slice of it.

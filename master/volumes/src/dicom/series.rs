@@ -3,7 +3,7 @@
 
 use super::elements::{File, Packing, Pixels, Tag};
 use super::wire::Preface;
-use super::{fragments, jpeg, rle};
+use super::{fragments, jpeg, jpeg_ls, rle};
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::samples::{DIM_MAX, Endian, Layout, Number};
 use crate::source::Source;
@@ -559,10 +559,14 @@ fn pixels_of(slice: &Slice, mut file: File, len: u64, number: Number) -> Result<
     let count = usize::from(format.columns) * usize::from(format.rows);
     let bytes = match file.pixels {
         Pixels::Packed(Packing::Rle) => rle::unpack(&mut *file.rest, count, size)?,
-        Pixels::Packed(Packing::Jpeg) => {
+        Pixels::Packed(packing) => {
             let most = jpeg::fragments_max_bytes(count * size);
             let fragment = fragments::read(&mut *file.rest, most)?;
-            jpeg::unpack(&fragment, (format.columns, format.rows), size)?
+            let sizes = (format.columns, format.rows);
+            match packing {
+                Packing::JpegLs => jpeg_ls::unpack(&fragment, sizes, size)?,
+                _ => jpeg::unpack(&fragment, sizes, size)?,
+            }
         }
         Pixels::Native { bytes: have, words } => {
             let need = (count * size) as u64;

@@ -79,7 +79,7 @@ pub(crate) fn open_series_of(file: &Path, hints: &Hints) -> Result<Opened, Probl
     let mut opened = dicom::open(&slices, folder, hints, hints.series.is_none().then_some(&*file))?;
     let name = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let count = opened.volume.lattice.dims[2];
-    if count > 1 {
+    if count > 1 && slices.len() > 1 {
         opened
             .notes
             .insert(0, format!("{name} is one of {count} slices; its whole series was read"));

@@ -574,8 +574,11 @@ fn raw_mutants_neither_panic_nor_hang_nor_fill_memory() {
 fn dicom_mutants_neither_panic_nor_hang_nor_fill_memory() {
     use crate::dicom::tests::{ALL, slice};
     let pixels = [1, -2, 300, 4, 5, 6];
-    let seeds: Vec<Vec<u8>> =
-        ALL.iter().map(|syntax| slice(*syntax, "1.2.3", 1.0, &pixels, &[("slope", "2")])).collect();
+    let one = |syntax: &_| slice(*syntax, "1.2.3", 1.0, &pixels, &[("slope", "2")]);
+    let frames = [(1.0, 1.0, 10), (0.0, 2.0, 20)];
+    let several = [(false, false), (false, true), (true, false), (true, true)]
+        .map(|(packed, delimited)| crate::dicom::enhanced(&frames, packed, delimited));
+    let seeds: Vec<Vec<u8>> = ALL.iter().map(one).chain(several).collect();
     survive(
         "dicom",
         mutants(),

@@ -23,7 +23,7 @@ pub(crate) struct Plain {
 impl Plain {
     /// Reads a source from its start; `gzip` says that it is compressed.
     pub(crate) fn new(source: Source, gzip: bool) -> Plain {
-        let Source { reader, len, cap, notes } = source;
+        let Source { reader, len, cap, notes, .. } = source;
         let reader: Box<dyn Read + Send> = match gzip {
             true => Box::new(Members::new(Packing::Gzip, reader, notes.clone())),
             false => Box::new(reader),

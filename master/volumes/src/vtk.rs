@@ -32,7 +32,7 @@ pub(crate) fn read(
     name: &str,
     dataset: Option<&str>,
 ) -> Result<Volume, Problem> {
-    let Source { reader, len, cap, notes } = source;
+    let Source { reader, len, cap, notes, .. } = source;
     let inner: Box<dyn BufRead + Send> = match gzip {
         true => {
             let members =

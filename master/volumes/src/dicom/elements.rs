@@ -5,6 +5,7 @@
 //! a file of 323 bytes, and depends on a crate with an advisory (`encoding`, unmaintained). A
 //! volume needs twenty elements, all short and in ASCII, and the position of the pixels.
 
+use super::frames::{Groups, PER_FRAME, SHARED};
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::samples::Endian;
 use crate::source::Source;
@@ -44,7 +45,7 @@ pub(super) const KEPT: [(Tag, &str); 24] = [
 ];
 
 /// Longest value that is kept; six numbers of 16 characters take 101 bytes.
-const VALUE_MAX_BYTES: u32 = 1024;
+pub(super) const VALUE_MAX_BYTES: u32 = 1024;
 /// Most bytes before the pixels: private elements can hold whole reports.
 const HEADER_MAX_BYTES: u64 = 64 << 20;
 /// Most elements of a file, since empty ones take few bytes.
@@ -52,7 +53,7 @@ const ELEMENTS_MAX: u32 = 1 << 20;
 /// Deepest nesting of sequences.
 const DEPTH_MAX: u32 = 64;
 /// Length of an element that a delimiter ends.
-const UNDEFINED: u32 = u32::MAX;
+pub(super) const UNDEFINED: u32 = u32::MAX;
 
 /// How pixels are stored.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -79,11 +80,15 @@ pub(super) enum Packing {
 
 /// A file read up to its pixels.
 pub(super) struct File {
-    values: BTreeMap<Tag, Vec<u8>>,
+    pub(super) values: BTreeMap<Tag, Vec<u8>>,
     pub(super) endian: Endian,
     pub(super) pixels: Pixels,
     /// Reader at the first byte of the pixels.
     pub(super) rest: Box<dyn BufRead>,
+    /// What is said of each of several frames.
+    pub(super) groups: Groups,
+    /// Place of the pixels, or of the first item of fragments; `None` inside deflate.
+    pub(super) pixels_at: Option<u64>,
 }
 
 /// Returns whether the first bytes are DICOM: with the preamble of 128 bytes and `DICM`, or
@@ -95,18 +100,19 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// How elements are encoded: with or without their types, and in which byte order.
 #[derive(Clone, Copy)]
-struct Syntax {
+pub(super) struct Syntax {
     explicit: bool,
     endian: Endian,
 }
 
 /// Position in the elements of a file, with the counts that are limited.
-struct ElementReader {
+pub(super) struct ElementReader {
     inner: Box<dyn BufRead>,
     /// Bytes read or skipped so far.
-    consumed_bytes: u64,
+    pub(super) consumed_bytes: u64,
     /// Elements read so far.
     elements: u32,
+    pub(super) groups: Groups,
 }
 
 impl File {
@@ -114,8 +120,12 @@ impl File {
     pub(super) fn open(mut source: Source) -> Result<File, Problem> {
         let part10 = source.head()?.get(128..132) == Some(b"DICM");
         let len = source.len;
-        let mut reader =
-            ElementReader { inner: Box::new(source.reader), consumed_bytes: 0, elements: 0 };
+        let mut reader = ElementReader {
+            inner: Box::new(source.reader),
+            consumed_bytes: 0,
+            elements: 0,
+            groups: Groups::default(),
+        };
         let mut values = BTreeMap::new();
         let mut syntax = Syntax { explicit: false, endian: Endian::Little };
         let (mut packing, mut deflated) = (None, false);
@@ -200,7 +210,9 @@ impl File {
                 ));
             }
         };
-        Ok(File { values, endian: syntax.endian, pixels, rest: reader.inner })
+        let pixels_at = (!deflated).then_some(reader.consumed_bytes);
+        let ElementReader { inner: rest, groups, .. } = reader;
+        Ok(File { values, endian: syntax.endian, pixels, rest, groups, pixels_at })
     }
 
     /// Returns a kept value as trimmed text; `None` if it is absent or empty.
@@ -282,7 +294,7 @@ impl ElementReader {
         Ok([chunk.first().copied().unwrap_or(0), chunk.get(1).copied().unwrap_or(0)])
     }
 
-    fn skip(&mut self, bytes: u64) -> Result<(), Problem> {
+    pub(super) fn skip(&mut self, bytes: u64) -> Result<(), Problem> {
         self.consumed_bytes = self.consumed_bytes.saturating_add(bytes);
         if self.consumed_bytes > HEADER_MAX_BYTES {
             return Err(malformed(format!("take more than {HEADER_MAX_BYTES} bytes")));
@@ -311,7 +323,7 @@ impl ElementReader {
     }
 
     /// Reads tag and length of the next element, and whether it has the type OW.
-    fn head(&mut self, s: Syntax) -> Result<(Tag, u32, bool), Problem> {
+    pub(super) fn head(&mut self, s: Syntax) -> Result<(Tag, u32, bool), Problem> {
         self.elements += 1;
         if self.elements > ELEMENTS_MAX {
             return Err(malformed(format!("are more than {ELEMENTS_MAX}")));
@@ -360,6 +372,10 @@ impl ElementReader {
         if tag == (0x7fe0, 0x0010) {
             return Ok(Some((bytes, words)));
         }
+        if tag == SHARED || tag == PER_FRAME {
+            self.groups(s, bytes, tag)?;
+            return Ok(None);
+        }
         if bytes == UNDEFINED {
             self.skip_undefined(s, 1)?;
             return Ok(None);
@@ -368,9 +384,7 @@ impl ElementReader {
             return Err(broken(&std::io::ErrorKind::UnexpectedEof.into()));
         }
         if KEPT.iter().any(|(kept, _)| *kept == tag) && bytes <= VALUE_MAX_BYTES {
-            let mut value = vec![0; bytes as usize];
-            self.inner.read_exact(&mut value).map_err(|e| broken(&e))?;
-            self.consumed_bytes += u64::from(bytes);
+            let value = self.value(bytes)?;
             values.insert(tag, value);
         } else {
             self.skip(bytes.into())?;
@@ -378,8 +392,16 @@ impl ElementReader {
         Ok(None)
     }
 
+    /// Reads a value of a few bytes.
+    pub(super) fn value(&mut self, bytes: u32) -> Result<Vec<u8>, Problem> {
+        let mut value = vec![0; bytes as usize];
+        self.inner.read_exact(&mut value).map_err(|e| broken(&e))?;
+        self.consumed_bytes += u64::from(bytes);
+        Ok(value)
+    }
+
     /// Skips a sequence or item of undefined length, up to its delimiter.
-    fn skip_undefined(&mut self, s: Syntax, depth: u32) -> Result<(), Problem> {
+    pub(super) fn skip_undefined(&mut self, s: Syntax, depth: u32) -> Result<(), Problem> {
         if depth > DEPTH_MAX {
             return Err(malformed(format!("stand in more than {DEPTH_MAX} sequences")));
         }

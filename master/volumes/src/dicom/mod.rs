@@ -8,6 +8,7 @@
 mod confine;
 mod elements;
 mod fragments;
+mod frames;
 mod jpeg;
 mod jpeg_ls;
 mod rle;
@@ -16,6 +17,8 @@ mod watch;
 mod wire;
 
 pub(crate) use elements::sniff;
+#[cfg(test)]
+pub(crate) use frames::tests::enhanced;
 #[cfg(test)]
 pub(crate) use jpeg_ls::tests::{encoded_pictures, one_jpeg_ls};
 #[cfg(test)]

@@ -24,7 +24,7 @@ pub(crate) const ALL: [Syntax; 6] = [
     Syntax::Lossless,
 ];
 
-fn element(
+pub(crate) fn element(
     out: &mut Vec<u8>,
     explicit: bool,
     big: bool,

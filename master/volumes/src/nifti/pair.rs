@@ -55,6 +55,12 @@ pub(crate) fn read(
         (header.qform_code, header.sform_code, header.inter, header.units) = (0, 0, 0.0, 2);
     }
     let layout = header.layout(endian)?;
+    if !nifti && let Some((stem, _)) = stem(name) {
+        let mat = format!("{stem}.mat");
+        if let Ok(Inside::File(..)) = Folder::open(folder, "file")?.find(Path::new(&mat)) {
+            notes.add(format!("SPM's place in {} was not read", quoted(&mat)));
+        }
+    }
     let (lattice, anatomical) = match nifti {
         true => header.lattice(layout.dims)?,
         false => analyze_lattice(&header, bytes, endian, &layout, &notes)?,

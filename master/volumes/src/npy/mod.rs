@@ -59,7 +59,7 @@ pub(crate) fn read_archive(
     hints: &RawHints,
     dataset: Option<&str>,
 ) -> Result<Volume, Problem> {
-    let Source { reader, len, cap, notes } = source;
+    let Source { reader, len, cap, notes, .. } = source;
     let mut archive = ZipArchive::new(reader).map_err(|e| zip_problem(&e))?;
     if archive.len() > MEMBERS_MAX {
         return Err(Problem::new(

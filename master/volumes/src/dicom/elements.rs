@@ -17,7 +17,7 @@ use std::io::{BufRead, Read};
 pub(super) type Tag = (u16, u16);
 
 /// Elements whose values are kept, with their names.
-pub(super) const KEPT: [(Tag, &str); 24] = [
+pub(super) const KEPT: [(Tag, &str); 26] = [
     ((0x0002, 0x0010), "TransferSyntaxUID"),
     ((0x0008, 0x0060), "Modality"),
     ((0x0008, 0x103e), "SeriesDescription"),
@@ -41,11 +41,15 @@ pub(super) const KEPT: [(Tag, &str); 24] = [
     ((0x0028, 0x0103), "PixelRepresentation"),
     ((0x0028, 0x1052), "RescaleIntercept"),
     ((0x0028, 0x1053), "RescaleSlope"),
+    ((0x3004, 0x000c), "GridFrameOffsetVector"),
+    ((0x3004, 0x000e), "DoseGridScaling"),
     ((0x7fe0, 0x0010), "PixelData"),
 ];
 
 /// Longest value that is kept; six numbers of 16 characters take 101 bytes.
 pub(super) const VALUE_MAX_BYTES: u32 = 1024;
+/// Longest GridFrameOffsetVector: 16 characters for each of 4096 frames, the most of 16 bits of length.
+const OFFSETS_MAX_BYTES: u32 = 1 << 16;
 /// Most bytes before the pixels: private elements can hold whole reports.
 const HEADER_MAX_BYTES: u64 = 64 << 20;
 /// Most elements of a file, since empty ones take few bytes.
@@ -383,7 +387,8 @@ impl ElementReader {
         if u64::from(bytes) > len.saturating_sub(self.consumed_bytes) {
             return Err(broken(&std::io::ErrorKind::UnexpectedEof.into()));
         }
-        if KEPT.iter().any(|(kept, _)| *kept == tag) && bytes <= VALUE_MAX_BYTES {
+        let most = if tag == (0x3004, 0x000c) { OFFSETS_MAX_BYTES } else { VALUE_MAX_BYTES };
+        if KEPT.iter().any(|(kept, _)| *kept == tag) && bytes <= most {
             let value = self.value(bytes)?;
             values.insert(tag, value);
         } else {

@@ -1,10 +1,11 @@
-//! Files of several frames (enhanced CT, MR, PET): what the functional groups say of each frame, and
-//! where its pixels are. Each frame then counts as a slice.
+//! Files of several frames: what the functional groups of enhanced CT, MR and PET say of each frame,
+//! or the offsets of a dose, and where its pixels are. Each frame then counts as a slice.
 
 use super::elements::{ElementReader, File, KEPT, Pixels, Syntax, Tag, UNDEFINED, VALUE_MAX_BYTES};
 use crate::error::{OpenErrorKind, Problem};
 use crate::samples::Endian;
 use crate::source::Source;
+use glam::DVec3;
 use std::collections::BTreeMap;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 
@@ -123,15 +124,53 @@ impl ElementReader {
     }
 }
 
-/// Returns the frames of a file that has functional groups; none for any other file.
+/// Gives the frames of a dose their places: along the normal, by GridFrameOffsetVector.
+fn place_doses(file: &mut File) -> Result<(), Problem> {
+    const FIELD: &str = "GridFrameOffsetVector";
+    let (position, directions) =
+        (file.numbers::<3>((0x0020, 0x0032))?, file.numbers::<6>((0x0020, 0x0037))?);
+    let (Some(text), Some(position), Some(d)) = (file.text((0x3004, 0x000c)), position, directions)
+    else {
+        return Ok(());
+    };
+    let offsets: Option<Vec<f64>> =
+        text.split('\\').map(|w| w.trim().parse().ok().filter(|x: &f64| x.is_finite())).collect();
+    let Some(offsets) = offsets else {
+        return Err(Problem::malformed(FIELD, "is not numbers", "get the file again"));
+    };
+    let normal = DVec3::new(d[0], d[1], d[2]).cross(DVec3::new(d[3], d[4], d[5]));
+    // They count from the first frame, or from the origin of the patient.
+    file.groups.frames = offsets
+        .iter()
+        .map(|offset| {
+            let at = DVec3::from_array(position) + normal * (offset - offsets[0]);
+            let text = format!("{}\\{}\\{}", at.x, at.y, at.z);
+            Values::from([((0x0020, 0x0032), text.into_bytes())])
+        })
+        .collect();
+    Ok(())
+}
+
+/// Returns the frames of a file that has functional groups or is a dose; none for any other file.
 pub(super) fn frames(file: &mut File) -> Result<Vec<Frame>, Problem> {
+    if file.groups.frames.is_empty() {
+        place_doses(file)?;
+    }
     let count = file.groups.frames.len();
     if count == 0 {
         return Ok(Vec::new());
     }
     let said = file.text((0x0028, 0x0008)).and_then(|n| n.parse::<usize>().ok()).unwrap_or(1);
     if said != count {
-        return Err(malformed(format!("has {count} frames, where NumberOfFrames says {said}")));
+        let field = match file.text((0x3004, 0x000c)) {
+            Some(_) => "GridFrameOffsetVector",
+            None => "PerFrameFunctionalGroupsSequence",
+        };
+        return Err(Problem::malformed(
+            field,
+            format!("has {count} frames, where NumberOfFrames says {said}"),
+            "get the file again",
+        ));
     }
     let Some(start) = file.pixels_at else {
         return Err(Problem::unsupported(

@@ -375,7 +375,12 @@ impl Slice {
             let column = DVec3::new(d[3], d[4], d[5]) * spacing[1];
             (DVec3::from_array(p), [row, column])
         });
-        let [slope] = file.numbers::<1>((0x0028, 0x1053))?.unwrap_or([1.0]);
+        // Of a dose, the grid's scale.
+        let slope = match file.numbers::<1>((0x0028, 0x1053))? {
+            None => file.numbers::<1>((0x3004, 0x000e))?,
+            slope => slope,
+        };
+        let [slope] = slope.unwrap_or([1.0]);
         let [intercept] = file.numbers::<1>((0x0028, 0x1052))?.unwrap_or([0.0]);
         let rescale = if slope == 0.0 { [1.0, 0.0] } else { [slope, intercept] };
         let instance = file.numbers::<1>((0x0020, 0x0013)).ok().flatten().map_or(0.0, |[n]| n);

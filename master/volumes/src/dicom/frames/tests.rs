@@ -102,6 +102,40 @@ pub(crate) fn enhanced(frames: &[(f64, f64, u16)], packed: bool, delimited: bool
     [&out[..], &table, &items, &DELIMITER].concat()
 }
 
+/// A dose of two frames of 3 x 2 pixels, with numbers from 10 on.
+fn dose(offsets: &str) -> Vec<u8> {
+    let mut file = enhanced(&[(0.0, 1.0, 10), (1.0, 1.0, 20)], false, false);
+    let start = file.windows(4).position(|w| w == [0x00, 0x52, 0x29, 0x92]).unwrap();
+    let pixels = file.windows(4).position(|w| w == [0xe0, 0x7f, 0x10, 0x00]).unwrap();
+    let places = item(&[
+        ((0x0020, 0x0032), "DS", b"1\\2\\30"),
+        ((0x0020, 0x0037), "DS", b"1\\0\\0\\0\\1\\0"),
+        ((0x0028, 0x0030), "DS", b"2\\0.5"),
+        ((0x3004, 0x000c), "DS", offsets.as_bytes()),
+        ((0x3004, 0x000e), "DS", b"0.5"),
+    ]);
+    file.splice(start..pixels, places);
+    file
+}
+
+#[test]
+fn frames_of_a_dose_lie_at_their_offsets_in_its_unit() {
+    // From the first frame, or from the patient's origin.
+    for (offsets, z, first) in
+        [("0\\2.5", 30.0, 5.0), ("30\\32.5", 30.0, 5.0), ("0\\-2.5", 27.5, 10.0)]
+    {
+        let (v, notes) = open(&dose(offsets)).unwrap();
+        assert_eq!((v.lattice.dims, notes.as_str()), ([3, 2, 2], ""));
+        assert_eq!(v.lattice.origin, DVec3::new(-1.0, -2.0, z), "{offsets}");
+        assert_eq!(v.lattice.steps[2], DVec3::Z * 2.5);
+        assert_eq!(v.summary.map.value(v.samples.code(0)), first);
+    }
+    let e = open(&dose("0")).unwrap_err();
+    assert!(e.contains("GridFrameOffsetVector: has 1 frames, where NumberOfFrames says 2"), "{e}");
+    let e = open(&dose("0\\x")).unwrap_err();
+    assert!(e.contains("GridFrameOffsetVector: is not numbers"), "{e}");
+}
+
 fn open(bytes: &[u8]) -> Result<(slabcast_common::volume::Volume, String), String> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.dcm");

@@ -139,7 +139,7 @@ fn push_grey(
         if channels >= 3 {
             grey &= at(0) == at(1) && at(1) == at(2);
         }
-        if channels % 2 == 0 {
+        if channels.is_multiple_of(2) {
             opaque &= at(channels - 1).iter().all(|b| *b == 0xff);
         }
         out.extend_from_slice(at(0));

@@ -49,7 +49,7 @@ pub(crate) fn jpeg(colours: bool) -> Vec<u8> {
         bits.push_str(&format!("{code}{value:0size$b}0"));
         (1..components).for_each(|_| bits.push_str("000"));
     }
-    while bits.len() % 8 != 0 {
+    while !bits.len().is_multiple_of(8) {
         bits.push('1');
     }
     for byte in bits.as_bytes().chunks(8) {

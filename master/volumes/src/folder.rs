@@ -6,7 +6,7 @@ use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::source::{Folder, Inside};
 #[cfg(feature = "zarr")]
 use crate::zarr;
-use crate::{Hints, Opened, pictures, tiff_stack};
+use crate::{Hints, Opened, pictures, tiff_stack, unread};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -59,11 +59,38 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
         ENDS.iter().any(|end| name.to_ascii_lowercase().ends_with(end)).then(|| quoted(&name))
     });
     let remedy = match (volumes.next(), volumes.next()) {
-        (None, _) => "give a file, or a folder with the slices or pictures of one volume".into(),
+        (None, _) => return Err(no_volume(folder, &files)),
         (Some(one), None) => format!("give the file {one} in it"),
         (Some(one), Some(two)) => format!("give one file in it, such as {one} or {two}"),
     };
     Err(Problem::new(OpenErrorKind::NotAVolume, "folder", "holds no slices or pictures", remedy))
+}
+
+/// Returns the error for a folder without volumes, which names what is in it if that is known.
+fn no_volume(folder: &Path, files: &[(PathBuf, Vec<u8>)]) -> Problem {
+    let problem = |what: String, remedy: &str| {
+        Problem::new(OpenErrorKind::NotAVolume, "folder", what, remedy)
+    };
+    if folder.join("attributes.json").is_file() {
+        return problem(
+            "is N5, or holds attributes.json of it, which is not read".into(),
+            "copy it to Zarr in Python, with zarr 2 (zarr.n5.N5Store and zarr.copy)",
+        );
+    }
+    let known = files.iter().find_map(|(path, head)| {
+        let name = path.file_name()?.to_string_lossy().into_owned();
+        unread::known(head, &name).map(|known| (name, known))
+    });
+    match known {
+        Some((name, (what, remedy))) => problem(
+            format!("holds no slices or pictures, but {}, which {what}", quoted(&name)),
+            remedy,
+        ),
+        None => problem(
+            "holds no slices or pictures".into(),
+            "give a file, or a folder with the slices or pictures of one volume",
+        ),
+    }
 }
 
 /// Opens the series that a DICOM file belongs to.

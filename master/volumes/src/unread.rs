@@ -166,6 +166,16 @@ const TEXT_BYTES: usize = 4096;
 /// Returns the error for a file that is known and not read; `None` for any other. `start` are its
 /// first bytes, after decompression if `gzip`.
 pub(crate) fn problem(start: &[u8], gzip: bool, name: &str) -> Option<Problem> {
+    let (what, remedy) = known(start, name)?;
+    let what = match gzip {
+        true => format!("{what}, inside gzip"),
+        false => format!("{what}, which is not read"),
+    };
+    Some(Problem::new(OpenErrorKind::NotAVolume, "content", what, remedy))
+}
+
+/// Returns what a file with these first bytes is (`is a BMP picture`), and the remedy.
+pub(crate) fn known(start: &[u8], name: &str) -> Option<(&'static str, &'static str)> {
     let name = name.to_ascii_lowercase();
     let text = &start[..start.len().min(TEXT_BYTES)];
     // Raw numbers may begin with two or four bytes of anything.
@@ -177,17 +187,30 @@ pub(crate) fn problem(start: &[u8], gzip: bool, name: &str) -> Option<Problem> {
         Text(word) => !text.contains(&0) && text.windows(word.len()).any(|w| w == word.as_bytes()),
         Name(end) => name.ends_with(end),
     };
-    let (_, what, remedy) = UNREAD.iter().find(|(mark, ..)| is(mark))?;
-    let what = match gzip {
-        true => format!("{what}, inside gzip"),
-        false => format!("{what}, which is not read"),
-    };
-    Some(Problem::new(OpenErrorKind::NotAVolume, "content", what, *remedy))
+    UNREAD.iter().find(|(mark, ..)| is(mark)).map(|(_, what, remedy)| (*what, *remedy))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn folder_of_what_is_not_read_says_what_it_holds() {
+        for (name, bytes, say) in [
+            (
+                "a.bmp",
+                &b"BM\x36\0"[..],
+                "but `a.bmp`, which is a BMP picture; save the stack as PNG",
+            ),
+            ("attributes.json", b"{}", "is N5, or holds attributes.json of it"),
+            ("a.txt", b"words", "holds no slices or pictures; give a file"),
+        ] {
+            let folder = tempfile::tempdir().unwrap();
+            std::fs::write(folder.path().join(name), bytes).unwrap();
+            let e = crate::open(folder.path()).unwrap_err().to_string();
+            assert!(e.contains(say), "{e}");
+        }
+    }
 
     #[test]
     fn format_that_is_not_read_is_named_with_the_program_that_converts_it() {

@@ -52,6 +52,9 @@ impl Format {
                 "leave them out",
             ));
         }
+        if !matches!(self, Format::NumpyArchive | Format::LegacyVtk) {
+            hints.check_no_dataset()?;
+        }
         match self {
             Format::Numpy => npy::read(source, gzip, name, &hints.raw),
             Format::NumpyArchive => npy::read_archive(source, name, &hints.raw, dataset),
@@ -60,5 +63,34 @@ impl Format {
             Format::Mrc => mrc::read(source, gzip, name),
             Format::LegacyVtk => vtk::read(source, gzip, name, dataset),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn open(bytes: Vec<u8>, hints: &Hints) -> Result<Volume, String> {
+        let source = Source::from_bytes(bytes);
+        crate::read(source, Path::new("."), "a", hints).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn flag_for_other_files_is_refused_and_spacing_of_numpy_is_taken() {
+        let dataset = Hints { dataset: Some("a".into()), ..Hints::default() };
+        let nifti = nifti::tests::nifti1(false, 2, [4, 3, 2], nifti::tests::Affine::Sform);
+        let numpy = npy::tests::npy(1, "<u2", false, "(2, 3, 4)");
+        for bytes in [numpy.clone(), mgh::tests::mgh(0, true), nifti] {
+            let e = open(bytes, &dataset).unwrap_err();
+            assert!(e.contains("--dataset: is for files of several arrays"), "{e}");
+        }
+        let raw = RawHints { spacing: Some([1.0, 2.0, 3.0]), ..RawHints::default() };
+        let spaced = Hints { raw, ..Hints::default() };
+        assert_eq!(open(numpy.clone(), &spaced).unwrap().lattice.spacing(), [1.0, 2.0, 3.0]);
+        let e = open(mgh::tests::mgh(0, true), &spaced).unwrap_err();
+        assert!(e.contains("--spacing") && e.contains("leave them out"), "{e}");
+        let typed = Hints { raw: raw.with_type("int8").unwrap(), ..Hints::default() };
+        let e = open(numpy, &typed).unwrap_err();
+        assert!(e.contains("--type") && e.contains("leave them out"), "{e}");
     }
 }

@@ -117,6 +117,18 @@ pub struct Hints {
 }
 
 impl Hints {
+    /// Refuses a name of an array for files without any.
+    fn check_no_dataset(&self) -> Result<(), Problem> {
+        match self.dataset {
+            None => Ok(()),
+            Some(_) => Err(Problem::malformed(
+                "--dataset",
+                "is for files of several arrays (.npz, .vtk), and this is none",
+                "leave it out",
+            )),
+        }
+    }
+
     fn cap(&self) -> ByteCap {
         ByteCap { asked: self.max_bytes }
     }
@@ -164,6 +176,7 @@ impl From<Volume> for Opened {
 
 fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
     if path.is_dir() {
+        hints.check_no_dataset()?;
         return folder::open(path, hints);
     }
     #[cfg_attr(
@@ -173,6 +186,7 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let mut source = Source { cap: hints.cap(), ..Source::open(path, "file")? };
     #[cfg(feature = "dicom")]
     if dicom::sniff(source.head()?) && hints.raw.dims.is_none() {
+        hints.check_no_dataset()?;
         return folder::open_series_of(path, hints);
     }
     let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -238,6 +252,7 @@ fn read_noted(
     hints: &Hints,
 ) -> Result<Opened, Problem> {
     if tiff_stack::sniff(source.head()?) && hints.raw.dims.is_none() {
+        hints.check_no_dataset()?;
         return tiff_stack::read(source, name, &hints.raw);
     }
     read(source, folder, name, hints).map(Opened::from)
@@ -258,6 +273,7 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
     if let Some(format) = Format::of(&if gzip { unpacked(head) } else { head.to_vec() }, gzip) {
         return format.read(source, gzip, folder, name, hints);
     }
+    hints.check_no_dataset()?;
     let has_header = head.starts_with(nrrd::MAGIC)
         || nifti::sniff(head)
         || metaimage::sniff(head)

@@ -29,9 +29,11 @@ fn files_that_are_no_volume_are_refused_with_kind_and_reason() {
         path
     };
     use OpenErrorKind::{Damaged, Malformed, NotAVolume, Unreadable, Unsupported};
+    let empty = dir.path().join("empty");
+    std::fs::create_dir(&empty).unwrap();
     for (path, kind, say) in [
         (dir.path().join("nowhere.nrrd"), Unreadable, "no such file"),
-        (dir.path().to_path_buf(), NotAVolume, "folder: holds no slices or pictures"),
+        (empty, NotAVolume, "folder: holds no slices or pictures"),
         (file("empty.nii", b""), NotAVolume, "is empty"),
         (file("a.png", b"\x89PNG\r\n\x1a\n0000"), NotAVolume, "is one PNG picture"),
         (file("a.nrrd", b"hello"), NotAVolume, "does not begin with `NRRD`"),

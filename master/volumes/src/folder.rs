@@ -38,8 +38,21 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     if !tiffs.is_empty() {
         return tiff_stack::read_files(tiffs, &name, &hints.raw, hints.cap());
     }
+    // Volume files that the user may have meant. A picture beside one may be its preview.
+    const ENDS: [&str; 18] = [
+        ".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd", ".vti", ".raw", ".raw.gz", ".hdr",
+        ".mgz", ".mgh", ".mrc", ".map", ".rec", ".npy", ".npz", ".vtk",
+    ];
+    let volumes: Vec<String> = files
+        .iter()
+        .filter_map(|(path, _)| {
+            let name = path.file_name()?.to_string_lossy().into_owned();
+            ENDS.iter().any(|end| name.to_ascii_lowercase().ends_with(end)).then(|| quoted(&name))
+        })
+        .collect();
     let (png, jpeg) = (matching(pictures::is_png), matching(pictures::is_jpeg));
-    if !png.is_empty() || !jpeg.is_empty() {
+    let has_pictures = !png.is_empty() || !jpeg.is_empty();
+    if has_pictures && volumes.is_empty() {
         let (chosen, left_out) = if png.is_empty() { (jpeg, 0) } else { (png, jpeg.len()) };
         let mut opened = pictures::read_files(chosen, &name, &hints.raw, hints.cap())?;
         if left_out > 0 {
@@ -49,21 +62,19 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
         }
         return Ok(opened);
     }
-    // Suggest volume files that the user may have meant.
-    const ENDS: [&str; 18] = [
-        ".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd", ".vti", ".raw", ".raw.gz", ".hdr",
-        ".mgz", ".mgh", ".mrc", ".map", ".rec", ".npy", ".npz", ".vtk",
-    ];
-    let mut volumes = files.iter().filter_map(|(path, _)| {
-        let name = path.file_name()?.to_string_lossy().into_owned();
-        ENDS.iter().any(|end| name.to_ascii_lowercase().ends_with(end)).then(|| quoted(&name))
-    });
-    let remedy = match (volumes.next(), volumes.next()) {
-        (None, _) => return Err(no_volume(folder, &files)),
-        (Some(one), None) => format!("give the file {one} in it"),
-        (Some(one), Some(two)) => format!("give one file in it, such as {one} or {two}"),
+    let remedy = match &volumes[..] {
+        [] => return Err(no_volume(folder, &files)),
+        [one] => format!("give the file {one} in it"),
+        [one, two, ..] => format!("give one file in it, such as {one} or {two}"),
     };
-    Err(Problem::new(OpenErrorKind::NotAVolume, "folder", "holds no slices or pictures", remedy))
+    let (what, remedy) = match has_pictures {
+        true => (
+            "holds pictures and volume files",
+            format!("{remedy}, or a folder of the pictures alone"),
+        ),
+        false => ("holds no slices or pictures", remedy),
+    };
+    Err(Problem::new(OpenErrorKind::NotAVolume, "folder", what, remedy))
 }
 
 /// Returns the error for a folder without volumes, which names what is in it if that is known.

@@ -154,6 +154,11 @@ fn stack_of_unequal_or_broken_pictures_is_refused_by_name() {
     let other = png((2, 2), (Grayscale, Eight), None, &[0, 1, 2, 3]);
     let e = open(&[("a.png", good()), ("b.png", other)]).unwrap_err();
     assert!(e.contains("`b.png`: is 2 x 2 uint8, where the first is 3 x 2 uint8; make all"), "{e}");
+    let e = open(&[("a.png", good()), ("b.nii.gz", vec![1])]).unwrap_err();
+    assert!(
+        e.contains("holds pictures and volume files; give the file `b.nii.gz` in it, or"),
+        "{e}"
+    );
     let cut = good()[..45].to_vec();
     let e = open(&[("a.png", good()), ("b.png", cut)]).unwrap_err();
     assert!(e.contains("`b.png` picture: ") && e.contains("get the"), "{e}");

@@ -5,7 +5,7 @@ use crate::fail::Fail;
 use crate::parse;
 use crate::progress;
 use slabcast_common::volume::Volume;
-use slabcast_volumes::{Hints, OpenError, Opened, RawHints};
+use slabcast_volumes::{FileNumbers, Hints, OpenError, Opened, RawHints};
 use std::ffi::OsString;
 use std::path::Path;
 
@@ -65,6 +65,7 @@ impl InputArgs {
             dicom_reader: dicom_reader(),
             level: self.level,
             max_bytes: self.max_bytes,
+            ..Hints::default()
         }
     }
 
@@ -81,6 +82,18 @@ impl InputArgs {
         let opened = open_with(path, &self.hints())?;
         opened.notes.iter().for_each(|note| progress::note(note));
         Ok(opened.volume)
+    }
+
+    /// Opens a volume like [`InputArgs::open`], to write it: with the file's own numbers where the
+    /// volume's codes round them.
+    ///
+    /// # Errors
+    /// Those of [`InputArgs::open`].
+    pub fn open_numbers(&self, path: &Path) -> Result<(Volume, Option<FileNumbers>), Fail> {
+        let opened = slabcast_volumes::open_numbers(path, &self.hints());
+        let (opened, numbers) = opened.map_err(|e| Fail::failed(e.to_string()))?;
+        opened.notes.iter().for_each(|note| progress::note(note));
+        Ok((opened.volume, numbers))
     }
 }
 

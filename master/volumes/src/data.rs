@@ -85,7 +85,7 @@ pub(crate) fn read(
     storage: &Storage,
     layout: &Layout,
 ) -> Result<(Samples, ValueMap), Problem> {
-    let cap = source.cap;
+    let cap = source.cap.clone();
     let (mut reader, supply) = open(source, len, storage, layout, layout.bytes())?;
     samples::read(&mut *reader, supply, &storage.decoded_layout(layout), cap)
 }

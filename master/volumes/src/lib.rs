@@ -53,6 +53,7 @@ mod members;
 mod metaimage;
 mod nifti;
 mod nrrd;
+mod numbers;
 #[cfg(test)]
 mod phantom;
 mod prefilter;
@@ -71,6 +72,7 @@ pub mod write;
 mod zarr;
 
 pub use error::{OpenError, OpenErrorKind, Problem};
+pub use numbers::{Beside, FileNumbers};
 pub use raw::RawHints;
 pub use sketch::histogram_sketch;
 pub use store::BrickStore;
@@ -102,11 +104,13 @@ pub struct Hints {
     /// Most bytes that the samples may have, in the file's type. `None` allows 1 GiB or 64 times
     /// the file's bytes, whichever is more, within three quarters of the free memory.
     pub max_bytes: Option<u64>,
+    /// What readers leave beside a volume; each opening has its own, so leave the default.
+    pub beside: Beside,
 }
 
 impl Hints {
     fn cap(&self) -> ByteCap {
-        ByteCap { asked: self.max_bytes }
+        ByteCap { asked: self.max_bytes, beside: self.beside.clone() }
     }
 }
 
@@ -136,12 +140,33 @@ pub fn open(path: &Path) -> Result<Volume, OpenError> {
 /// Those of [`open`]. Also hints that contradict the file: a type or spacing for a file with a
 /// header, an unknown series or level, sizes that do not match the file's length.
 pub fn open_with(path: &Path, hints: &Hints) -> Result<Opened, OpenError> {
+    open_beside(path, &Hints { beside: Beside::new(false), ..hints.clone() })
+}
+
+/// Opens a volume like [`open_with`], to write it: also returns the file's own numbers where the
+/// volume's codes round them (integers of 32 and 64 bits, float64). These take up to 8 bytes a
+/// sample beside the volume.
+///
+/// # Errors
+/// Those of [`open_with`].
+pub fn open_numbers(
+    path: &Path,
+    hints: &Hints,
+) -> Result<(Opened, Option<FileNumbers>), OpenError> {
+    let hints = Hints { beside: Beside::new(true), ..hints.clone() };
+    let opened = open_beside(path, &hints)?;
+    Ok((opened, hints.beside.take_numbers()))
+}
+
+fn open_beside(path: &Path, hints: &Hints) -> Result<Opened, OpenError> {
     let shown = path.to_string_lossy();
-    let volume = match shown.strip_prefix(formula::PREFIX) {
+    let opened = match shown.strip_prefix(formula::PREFIX) {
         Some(_) => formula::open(&shown).map(Opened::from),
         None => open_file(path, hints),
     };
-    volume.map_err(|problem| OpenError { file: shown.into_owned(), problem })
+    let mut opened = opened.map_err(|problem| OpenError { file: shown.into_owned(), problem })?;
+    opened.notes.extend(hints.beside.take_notes());
+    Ok(opened)
 }
 
 impl From<Volume> for Opened {

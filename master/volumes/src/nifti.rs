@@ -24,7 +24,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// Reads a volume from the start of a source.
 pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Problem> {
-    let (len, cap) = (source.len, source.cap);
+    let (len, cap, beside) = (source.len, source.cap.clone(), source.cap.beside);
     let mut reader: Box<dyn Read + Send> = match gzip {
         true => Box::new(Members::new(Packing::Gzip, source.reader, source.notes.clone())),
         false => Box::new(source.reader),
@@ -62,6 +62,9 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
     };
     let (samples, stored) = samples::read(reader, supply, &layout, cap)?;
     let map = header.value_map(stored);
+    if let Some(rescale) = header.rescale() {
+        beside.rescale(rescale);
+    }
     let volume = Volume::new(name, layout.number.name(), anatomical, lattice, samples, map);
     let (lo, hi) = volume.summary.range();
     if !(lo.is_finite() && hi.is_finite() && map.scale.is_normal()) {
@@ -321,14 +324,20 @@ impl Header {
         ))
     }
 
-    /// Returns the map from codes to values: `stored`, then the header's slope and intercept.
-    fn value_map(&self, stored: ValueMap) -> ValueMap {
+    /// Returns slope and intercept, if the header has them.
+    fn rescale(&self) -> Option<ValueMap> {
         // "If the scl_slope field is nonzero" (nifti1.h); SPM writes NaN for none.
         if self.slope == 0.0 || !self.slope.is_finite() {
-            return stored;
+            return None;
         }
-        let inter = if self.inter.is_finite() { self.inter } else { 0.0 };
-        ValueMap { scale: self.slope * stored.scale, offset: self.slope * stored.offset + inter }
+        let offset = if self.inter.is_finite() { self.inter } else { 0.0 };
+        Some(ValueMap { scale: self.slope, offset })
+    }
+
+    /// Returns the map from codes to values: `stored`, then the header's slope and intercept.
+    fn value_map(&self, stored: ValueMap) -> ValueMap {
+        let Some(ValueMap { scale, offset }) = self.rescale() else { return stored };
+        ValueMap { scale: scale * stored.scale, offset: scale * stored.offset + offset }
     }
 }
 

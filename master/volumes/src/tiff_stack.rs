@@ -44,7 +44,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// Reads the pages of one file as slices.
 pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Opened, Problem> {
-    let (len, cap) = (source.len, source.cap);
+    let (len, cap) = (source.len, source.cap.clone());
     let mut pages = TiffFile::open(source)?;
     let first = pages.page()?;
     let mut description = pages.description(&first)?;

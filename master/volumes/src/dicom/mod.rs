@@ -137,10 +137,12 @@ fn read_volume(
     let layout = Layout::new(lattice.dims.map(u64::from), number, Endian::Little, "slices")?;
     lattice.check().map_err(|e| Problem::malformed("slices", e, "get the series again"))?;
     let supply = Supply::Encoded { name: "DICOM", bytes, ratio: RLE_RATIO };
+    let beside = cap.beside.clone();
     let (samples, stored) = samples::read(pipe, supply, &layout, cap).map_err(|mut p| {
         p.field = "slices".into();
         p
     })?;
+    beside.rescale(ValueMap { scale: slope, offset: intercept });
     let map = ValueMap { scale: slope * stored.scale, offset: slope * stored.offset + intercept };
     let volume = Volume::new(name, number.name(), anatomical, lattice, samples, map);
     let (lo, hi) = volume.summary.range();

@@ -35,7 +35,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// Reads a volume from the start of a source.
 pub(crate) fn read(source: Source, name: &str) -> Result<Volume, Problem> {
-    let (len, cap) = (source.len, source.cap);
+    let (len, cap) = (source.len, source.cap.clone());
     let mut tags = Tags::new(source.reader);
     let (mut file, mut image, mut section) = (None, None, None);
     // The array to draw, if its data are appended, and its offset in the appended data.

@@ -5,6 +5,7 @@ use super::codec::{Codecs, Shard};
 use super::json::{self, Json};
 use crate::error::{OpenErrorKind, Problem};
 use crate::limit::ByteCap;
+use crate::numbers::Beside;
 use crate::samples::{Endian, Number, reserve};
 use crate::source::{Folder, Inside, not_inside};
 use crate::wide;
@@ -222,7 +223,7 @@ impl Array {
 
     /// Returns the bytes of the chunk files, or 0 where the limit does not depend on them. Counts
     /// only until the limit is met.
-    pub(super) fn stored_bytes(&self, cap: ByteCap, placed: &Placed) -> u64 {
+    pub(super) fn stored_bytes(&self, cap: &ByteCap, placed: &Placed) -> u64 {
         let enough = cap.stored_for(placed.bytes(self));
         let mut stored = 0;
         let mut cell = vec![0u64; self.shape.len()];
@@ -247,8 +248,12 @@ impl Array {
         stored
     }
 
-    /// Reads the samples along the axes of `placed`.
-    pub(super) fn read(&self, placed: &Placed) -> Result<(Samples, ValueMap), Problem> {
+    /// Reads the samples along the axes of `placed`. What codes do not hold is left `beside`.
+    pub(super) fn read(
+        &self,
+        placed: &Placed,
+        beside: &Beside,
+    ) -> Result<(Samples, ValueMap), Problem> {
         let shifted = |offset| ValueMap { scale: 1.0, offset };
         macro_rules! le {
             ($t:ty) => {
@@ -265,19 +270,11 @@ impl Array {
             }
             Number::F32 => (Samples::F32(self.collect(placed, le!(f32))?), ValueMap::IDENTITY),
             // Their range decides the codes, so all are kept in their type first.
-            Number::U32 => {
-                wide::compact_integers(self.collect_pieces(placed, le!(u32))?, i128::from)?
-            }
-            Number::I32 => {
-                wide::compact_integers(self.collect_pieces(placed, le!(i32))?, i128::from)?
-            }
-            Number::U64 => {
-                wide::compact_integers(self.collect_pieces(placed, le!(u64))?, i128::from)?
-            }
-            Number::I64 => {
-                wide::compact_integers(self.collect_pieces(placed, le!(i64))?, i128::from)?
-            }
-            Number::F64 => wide::compact_doubles(self.collect_pieces(placed, le!(f64))?)?,
+            Number::U32 => wide::compact_integers(self.collect_pieces(placed, le!(u32))?, beside)?,
+            Number::I32 => wide::compact_integers(self.collect_pieces(placed, le!(i32))?, beside)?,
+            Number::U64 => wide::compact_integers(self.collect_pieces(placed, le!(u64))?, beside)?,
+            Number::I64 => wide::compact_integers(self.collect_pieces(placed, le!(i64))?, beside)?,
+            Number::F64 => wide::compact_doubles(self.collect_pieces(placed, le!(f64))?, beside)?,
         })
     }
 
@@ -516,8 +513,7 @@ fn separator(asked: Option<Json>, usual: char) -> Result<char, Problem> {
 
 /// Returns the type that version 3 calls `name`.
 fn number(name: &str) -> Option<Number> {
-    let floats = [Number::F32, Number::F64];
-    Number::INTEGERS.into_iter().chain(floats).find(|n| n.name() == name)
+    Number::named(name)
 }
 
 /// Returns the fill value as little-endian bytes of a sample.

@@ -132,9 +132,9 @@ fn read(
     };
     array.check_counts(&placed)?;
     // Missing chunks are filled, so no byte need be there for a sample.
-    cap.check(placed.bytes(&array), array.stored_bytes(cap, &placed), "shape")?;
+    cap.check(placed.bytes(&array), array.stored_bytes(&cap, &placed), "shape")?;
     notes.extend(placed.notes.iter().cloned());
-    let (samples, map) = array.read(&placed)?;
+    let (samples, map) = array.read(&placed, &cap.beside)?;
     lattice
         .check()
         .map_err(|e| Problem::malformed("coordinateTransformations", e, "correct the scale"))?;

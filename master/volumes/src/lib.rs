@@ -56,6 +56,7 @@ mod nrrd;
 mod numbers;
 #[cfg(test)]
 mod phantom;
+mod pick;
 mod prefilter;
 mod raw;
 mod samples;
@@ -73,6 +74,7 @@ mod zarr;
 
 pub use error::{OpenError, OpenErrorKind, Problem};
 pub use numbers::{Beside, FileNumbers};
+pub use pick::Pick;
 pub use raw::RawHints;
 pub use sketch::histogram_sketch;
 pub use store::BrickStore;
@@ -104,6 +106,8 @@ pub struct Hints {
     /// Most bytes that the samples may have, in the file's type. `None` allows 1 GiB or 64 times
     /// the file's bytes, whichever is more, within three quarters of the free memory.
     pub max_bytes: Option<u64>,
+    /// Which volume of a file with several; the first by default.
+    pub pick: Pick,
     /// What readers leave beside a volume; each opening has its own, so leave the default.
     pub beside: Beside,
 }
@@ -240,6 +244,7 @@ fn read_noted(
     hints: &Hints,
 ) -> Result<Opened, Problem> {
     if tiff_stack::sniff(source.head()?) && hints.raw.dims.is_none() {
+        source.pick = hints.pick;
         return tiff_stack::read(source, name, &hints.raw);
     }
     read(source, folder, name, hints).map(Opened::from)
@@ -247,6 +252,7 @@ fn read_noted(
 
 /// Reads a volume; its first bytes decide the format. `folder` is where detached data may lie.
 fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<Volume, Problem> {
+    source.pick = hints.pick;
     let head = source.head()?;
     if head.is_empty() {
         return Err(Problem::new(OpenErrorKind::NotAVolume, "content", "is empty", READS));
@@ -254,6 +260,7 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
     // With --dims the file is raw numbers, whatever its content looks like.
     if hints.raw.dims.is_some() {
         let gzip = head.starts_with(GZIP);
+        hints.pick.choose(&[], "content")?;
         return raw::read(source, gzip, name, &hints.raw);
     }
     let has_header = head.starts_with(nrrd::MAGIC)
@@ -301,6 +308,7 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
         return metaimage::read(source, folder, name);
     }
     if vti::sniff(head) {
+        hints.pick.choose(&[], "content")?;
         return vti::read(source, name);
     }
     if tiff_stack::sniff(head) {

@@ -4,8 +4,10 @@
 //! versions. World axes are RAS+ by definition. The affine is the sform if its code is above zero,
 //! else the qform, else the spacings alone (methods 3, 2 and 1 of nifti1.h), as in nibabel.
 
+use crate::data;
 use crate::error::{OpenErrorKind, Problem};
 use crate::members::{Members, Packing};
+use crate::pick::{Axis, Kind, Part, Pick};
 use crate::samples::{self, Endian, Layout, Number, SKIP_MAX_BYTES, Supply};
 use crate::source::{self, Source};
 use glam::{DMat3, DVec3};
@@ -24,6 +26,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// Reads a volume from the start of a source.
 pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Problem> {
+    let (source_pick, said) = (source.pick, source.notes.clone());
     let (len, cap, beside) = (source.len, source.cap.clone(), source.cap.beside);
     let mut reader: Box<dyn Read + Send> = match gzip {
         true => Box::new(Members::new(Packing::Gzip, source.reader, source.notes.clone())),
@@ -46,7 +49,8 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
     };
     fill(reader, &mut bytes[4..size])?;
     let header = Header::parse(&bytes[..size], endian)?;
-    let layout = header.layout(endian)?;
+    let (layout, part, notes) = header.layout(endian, source_pick)?;
+    notes.into_iter().for_each(|note| said.add(note));
     let (lattice, anatomical) = header.lattice(layout.dims)?;
     let skip = header.skip_bytes(size as u64)?;
     if !source::skip_bytes(reader, skip).map_err(|e| broken(&e))? {
@@ -60,7 +64,10 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
         true => Supply::deflate("gzip", len),
         false => Supply::Plain { have: len.saturating_sub(size as u64 + skip) },
     };
-    let (samples, stored) = samples::read(reader, supply, &layout, cap)?;
+    let (samples, stored) = match &part {
+        Some(part) => data::read_part(reader, supply, part, &layout, cap)?,
+        None => samples::read(reader, supply, &layout, cap)?,
+    };
     let map = header.value_map(stored);
     if let Some(rescale) = header.rescale() {
         beside.rescale(rescale);
@@ -202,7 +209,13 @@ impl Header {
         })
     }
 
-    fn layout(&self, endian: Endian) -> Result<Layout, Problem> {
+    /// Returns the layout of the volume that is read, which part of the samples it is, if not all,
+    /// and notes.
+    fn layout(
+        &self,
+        endian: Endian,
+        pick: Pick,
+    ) -> Result<(Layout, Option<Part>, Vec<String>), Problem> {
         let number = match self.datatype {
             2 => Number::U8,
             4 => Number::I16,
@@ -214,12 +227,12 @@ impl Header {
             768 => Number::U32,
             1024 => Number::I64,
             1280 => Number::U64,
+            // Components of 8 bits beside each other.
+            128 | 2304 => Number::U8,
             code => {
                 let name = match code {
                     1 => "one bit a voxel",
                     32 | 1792 | 2048 => "complex numbers",
-                    128 => "RGB colours",
-                    2304 => "RGBA colours",
                     1536 => "128-bit floats",
                     _ => "not a type of the NIfTI format",
                 };
@@ -240,15 +253,54 @@ impl Header {
                 ));
             }
         };
-        if let Some(a) = (4..=axes).find(|&a| self.dim[a] > 1) {
-            return Err(Problem::unsupported(
-                format!("dim[{a}]"),
-                format!("is {}: there is more than one volume", self.dim[a]),
-                "extract one of them into a file of its own",
-            ));
+        let dims: [u64; 3] = std::array::from_fn(|a| self.dim[a + 1].try_into().unwrap_or(0));
+        let layout = Layout::new(dims, number, endian, "dim")?;
+        let colours = match self.datatype {
+            128 => Some(("RGB", 3)),
+            2304 => Some(("RGBA", 4)),
+            _ => None,
+        };
+        let mut more = Vec::new();
+        if let Some((name, size)) = colours {
+            let axis = Axis::new(Kind::Channel, format!("colours ({name})"), size);
+            more.push(Axis { of_voxel: true, ..axis });
         }
-        let dims = std::array::from_fn(|a| self.dim[a + 1].try_into().unwrap_or(0));
-        Layout::new(dims, number, endian, "dim")
+        for a in 4..=axes {
+            let Ok(size @ 1..) = u64::try_from(self.dim[a]) else {
+                return Err(Problem::malformed(
+                    format!("dim[{a}]"),
+                    format!("is {}", self.dim[a]),
+                    "correct it (1 if there is one volume)",
+                ));
+            };
+            more.push(match a {
+                4 => Axis::new(Kind::Time, "times", size),
+                // The standard's place for the components of vectors.
+                5 => Axis { of_voxel: true, ..Axis::new(Kind::Channel, "components", size) },
+                _ => Axis::new(Kind::Other, format!("along dim[{a}]"), size),
+            });
+        }
+        if more.iter().all(|axis| axis.size == 1) {
+            more.clear();
+        }
+        let field = match (colours, more.iter().any(|a| a.of_voxel && a.size > 1)) {
+            (Some(_), _) => "datatype",
+            (None, true) => "dim[5]",
+            _ => "dim[4]",
+        };
+        let (at, notes) = pick.choose(&more, field)?;
+        if more.is_empty() {
+            return Ok((layout, None, notes));
+        }
+        let mut sizes: Vec<u64> = more.iter().map(|axis| axis.size).collect();
+        let mut at: Vec<Option<u64>> = at.into_iter().map(Some).collect();
+        let first = usize::from(colours.is_some());
+        sizes.splice(first..first, dims);
+        at.splice(first..first, [None; 3]);
+        let part = Part::new(&sizes, at, number.bytes()).ok_or_else(|| {
+            Problem::malformed("dim", "has more samples than can be", "correct it")
+        })?;
+        Ok((layout, Some(part), notes))
     }
 
     /// Returns the bytes between the header and the first sample.

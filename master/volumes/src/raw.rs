@@ -146,7 +146,7 @@ pub(crate) fn read(
         byte_skip: Skip::Bytes(skip),
         skip_field: "--skip",
     };
-    let (samples, map) = data::read(source, len, &storage, &layout)?;
+    let (samples, map) = data::read(source, len, &storage, &layout, None)?;
     Ok(Volume::new(name, number.name(), false, lattice, samples, map))
 }
 

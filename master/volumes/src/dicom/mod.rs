@@ -18,6 +18,7 @@ pub(crate) use series::one_slice;
 
 use crate::error::{OpenErrorKind, Problem};
 use crate::limit::ByteCap;
+use crate::pick::Pick;
 use crate::samples::{self, Endian, Layout, Supply};
 use crate::{Hints, Opened};
 use confine::{CPU_SECS, MEMORY_BYTES};
@@ -55,7 +56,7 @@ pub(crate) fn open(
                 // The receiver reports a panic, since the pipe then ends before the series.
                 let _ = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
                     // A receiver that is gone has failed on its own.
-                    let choice = SeriesChoice { series, file };
+                    let choice = SeriesChoice { series, file, pick: hints.pick };
                     let _ = write_series(files, &choice, Vec::new(), &mut sender);
                 }));
             });
@@ -70,6 +71,12 @@ pub(crate) fn open(
     }
     if let Some(file) = file {
         command.arg("--file").arg(file);
+    }
+    let Pick { volume, time, channel } = hints.pick;
+    for (flag, index) in [("--volume", volume), ("--time", time), ("--channel", channel)] {
+        if let Some(index) = index {
+            command.arg(flag).arg(index.to_string());
+        }
     }
     command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let (mut child, stdout, stderr) = Watched::start(&mut command, wall_limit(stored))
@@ -193,7 +200,7 @@ impl Write for WriteTracker<'_> {
 /// and writes one series, or the problem that prevents it, to `out`.
 ///
 /// `series` names the series (its number, description, name or UID); `file` is a slice whose series
-/// is meant. First the process confines itself for good, where the system allows it: 512 MiB of
+/// is meant, and `pick` one of its times. First the process confines itself for good, where the system allows it: 512 MiB of
 /// memory, 120 s of processor time, the files of the folder to read, nothing to write but `out`, no
 /// network and no other process. What the system did not allow goes with the series as a note.
 ///
@@ -204,11 +211,12 @@ pub fn serve(
     folder: &Path,
     series: Option<&str>,
     file: Option<&Path>,
+    pick: Pick,
     out: &mut dyn Write,
 ) -> std::io::Result<()> {
     let notes = confine::confine(folder);
     match crate::folder::dicom_files(folder) {
-        Ok(files) => write_series(&files, &SeriesChoice { series, file }, notes, out),
+        Ok(files) => write_series(&files, &SeriesChoice { series, file, pick }, notes, out),
         Err(problem) => wire::write_problem(&problem, out),
     }
 }

@@ -50,7 +50,7 @@ impl Notes {
 
 /// Enough to recognise a format ([`Source::head`]) with few system calls. Samples are read past the
 /// buffer in larger pieces.
-const BUFFER_BYTES: usize = 64 << 10;
+pub(crate) const BUFFER_BYTES: usize = 64 << 10;
 
 impl Source {
     /// Opens a regular file; refuses a folder, pipe, socket or device without reading it.

@@ -127,3 +127,22 @@ fn labels_and_doubles_are_converted_to_the_bit() {
         }
     }
 }
+
+#[test]
+fn blanked_points_of_vti_have_no_value_and_masks_are_never_the_volume() {
+    for (file, blanked) in [
+        ("resampled_ball.vti", true),
+        ("vtkGhostType_first.vti", true),
+        ("vtkValidPointMask_first.vti", false),
+    ] {
+        let Some(opened) = fault(&format!("09-vti-blanked-and-ghost/{file}")) else { return };
+        let summary = &opened.volume.summary;
+        let notes = opened.notes.join("\n");
+        assert_eq!(summary.nan > 0, blanked, "{file}: {notes}");
+        assert_eq!(notes.contains("are blanked by `vtk"), blanked, "{file}: {notes}");
+        if file.contains("first") {
+            let (lo, hi) = summary.range();
+            assert!(lo == 0.0 && hi == 209.0, "{file}: {lo} to {hi}");
+        }
+    }
+}

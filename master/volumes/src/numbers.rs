@@ -153,6 +153,15 @@ impl Beside {
         }
     }
 
+    /// Notes a value that stands for none.
+    pub(crate) fn filler(&self, value: f64) {
+        if !self.keep {
+            self.left().notes.push(format!(
+                "the value {value:.4e} stands alone beyond float32 and was taken for none (NaN)"
+            ));
+        }
+    }
+
     pub(crate) fn take_notes(&self) -> Vec<String> {
         std::mem::take(&mut self.left().notes)
     }

@@ -51,15 +51,32 @@ pub(crate) fn compact_integers<T: Wide + Ord + Into<i128>>(
     Ok((Samples::F32(codes), map))
 }
 
+const F32_MAX: f64 = f32::MAX as f64;
+
 /// Converts doubles to f32 codes; rescales them where f32 would overflow, flush to zero or be too
-/// coarse. Notes by how much they were rounded, or keeps the doubles.
+/// coarse. Notes by how much they were rounded, or keeps the doubles. A filler beyond f32 becomes
+/// NaN.
 pub(crate) fn compact_doubles(
     pieces: Vec<Vec<f64>>,
     beside: &Beside,
 ) -> Result<(Samples, ValueMap), Problem> {
-    let finite = || pieces.iter().flatten().copied().filter(|v| v.is_finite());
-    let (lo, hi) =
-        finite().fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), v| (lo.min(v), hi.max(v)));
+    let all = || pieces.iter().flatten().copied();
+    let range = |most: f64| {
+        let inside = all().filter(|v| v.abs() <= most);
+        inside.fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), v| (lo.min(v), hi.max(v)))
+    };
+    let (mut lo, mut hi) = range(f64::MAX);
+    // One value alone beyond f32, such as -1.8e308, stands for none. By its range all others would
+    // become one code.
+    let beyond = |v: &f64| v.is_finite() && v.abs() > F32_MAX;
+    let inner = range(F32_MAX);
+    let filler = all()
+        .find(beyond)
+        .filter(|filler| inner.0 <= inner.1 && all().filter(beyond).all(|v| v == *filler));
+    if let Some(filler) = filler {
+        (lo, hi) = inner;
+        beside.filler(filler);
+    }
     let map = if lo > hi || f32_keeps_range(lo, hi) {
         ValueMap::IDENTITY
     } else if hi == lo {
@@ -72,6 +89,9 @@ pub(crate) fn compact_doubles(
     };
     let mut most = 0.0f64;
     let codes = convert_beside(pieces, map, beside, |v| {
+        if Some(v) == filler {
+            return f32::NAN;
+        }
         let code = ((v - map.offset) / map.scale) as f32;
         // The difference of infinities is NaN, which `max` leaves out.
         most = most.max((map.value(code.into()) - v).abs());
@@ -87,7 +107,7 @@ pub(crate) fn compact_doubles(
 fn f32_keeps_range(lo: f64, hi: f64) -> bool {
     let largest = lo.abs().max(hi.abs());
     let span = hi - lo;
-    if largest > f64::from(f32::MAX) {
+    if largest > F32_MAX {
         return false;
     }
     if span == 0.0 {

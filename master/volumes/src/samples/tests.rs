@@ -104,6 +104,18 @@ fn float64_beyond_f32_is_rescaled_and_nan_and_infinity_stay() {
 }
 
 #[test]
+fn one_filler_beyond_f32_does_not_take_the_values_of_the_others() {
+    for filler in [1e300, -f64::MAX] {
+        let numbers = [0.0, filler, 1000.0, 250.0, filler];
+        let bytes: Vec<u8> = numbers.iter().flat_map(|x| x.to_le_bytes()).collect();
+        let got = read_all(&bytes, 5, Number::F64, Endian::Little).unwrap();
+        let v = values(&got);
+        assert_eq!([v[0], v[2], v[3]], [0.0, 1000.0, 250.0]);
+        assert!(v[1].is_nan() && v[4].is_nan(), "{v:?}");
+    }
+}
+
+#[test]
 fn oversized_dimensions_are_refused_before_memory_is_taken() {
     for dims in [[0, 1, 1], [16385, 1, 1], [16384, 16384, 16384], [u64::MAX; 3]] {
         assert!(Layout::new(dims, Number::F64, Endian::Little, "sizes").is_err(), "{dims:?}");

@@ -16,8 +16,9 @@ use std::io::{BufRead, Read};
 pub(super) type Tag = (u16, u16);
 
 /// Elements whose values are kept, with their names.
-pub(super) const KEPT: [(Tag, &str); 24] = [
+pub(super) const KEPT: [(Tag, &str); 26] = [
     ((0x0002, 0x0010), "TransferSyntaxUID"),
+    ((0x0008, 0x0008), "ImageType"),
     ((0x0008, 0x0060), "Modality"),
     ((0x0008, 0x103e), "SeriesDescription"),
     ((0x0018, 0x0050), "SliceThickness"),
@@ -40,6 +41,7 @@ pub(super) const KEPT: [(Tag, &str); 24] = [
     ((0x0028, 0x0103), "PixelRepresentation"),
     ((0x0028, 0x1052), "RescaleIntercept"),
     ((0x0028, 0x1053), "RescaleSlope"),
+    ((0x0028, 0x3000), "ModalityLUTSequence"),
     ((0x7fe0, 0x0010), "PixelData"),
 ];
 
@@ -345,6 +347,10 @@ impl ElementReader {
         if tag == (0x7fe0, 0x0010) {
             return Ok(Some((bytes, words)));
         }
+        if tag == (0x0028, 0x3000) && bytes > 0 {
+            // That it is there is enough.
+            values.insert(tag, b"1".to_vec());
+        }
         if bytes == UNDEFINED {
             self.skip_undefined(s, 1)?;
             return Ok(None);
@@ -352,7 +358,8 @@ impl ElementReader {
         if u64::from(bytes) > len.saturating_sub(self.consumed_bytes) {
             return Err(broken(&std::io::ErrorKind::UnexpectedEof.into()));
         }
-        if KEPT.iter().any(|(kept, _)| *kept == tag) && bytes <= VALUE_MAX_BYTES {
+        let sequence = tag == (0x0028, 0x3000);
+        if KEPT.iter().any(|(kept, _)| *kept == tag) && bytes <= VALUE_MAX_BYTES && !sequence {
             let mut value = vec![0; bytes as usize];
             self.inner.read_exact(&mut value).map_err(|e| broken(&e))?;
             self.consumed_bytes += u64::from(bytes);

@@ -30,6 +30,8 @@ struct Slice {
     thickness_note: Option<String>,
     /// Bytes of uncompressed pixels; `None` where they are packed.
     native_bytes: Option<u64>,
+    /// Whether the stored numbers are indices of a palette.
+    palette: bool,
 }
 
 /// Size and number format of a picture. All slices of a series have one size; each may have a
@@ -297,6 +299,22 @@ impl Slice {
                 "leave it out",
             );
         }
+        let has = |tag: Tag, word: &str| file.text(tag).is_some_and(|t| t.contains(word));
+        if has((0x0008, 0x0008), "MOSAIC") {
+            return refuse(
+                "ImageType",
+                "is MOSAIC: all slices of a time lie side by side in one picture (Siemens)".into(),
+                "convert the series with dcm2niix",
+            );
+        }
+        if file.text((0x0028, 0x3000)).is_some() {
+            return refuse(
+                "ModalityLUTSequence",
+                "gives the values by a table, which is not read".into(),
+                "apply it, for instance with pydicom's apply_modality_lut, and save the result",
+            );
+        }
+        let palette = has((0x0028, 0x0004), "PALETTE");
         let allocated = need((0x0028, 0x0100))?;
         let stored = file.short((0x0028, 0x0101)).unwrap_or(allocated);
         let high = file.short((0x0028, 0x0102)).unwrap_or(stored.saturating_sub(1));
@@ -370,6 +388,7 @@ impl Slice {
             instance,
             thickness_note,
             native_bytes,
+            palette,
         })
     }
 
@@ -440,6 +459,9 @@ fn arrange(series: &mut Series, pick: &Pick, notes: &mut Vec<String>) -> Result<
             padded.len()
         ));
     }
+    if slices.iter().any(|s| s.palette) {
+        notes.push("its colours come from a palette; the stored indices were read".into());
+    }
     if slices.iter().any(|s| s.format != format) {
         notes.push(format!(
             "the slices of {} differ in BitsAllocated, BitsStored, HighBit or PixelRepresentation; \
@@ -500,6 +522,11 @@ fn arrange(series: &mut Series, pick: &Pick, notes: &mut Vec<String>) -> Result<
     // One rescale for all slices goes into the value map; several turn all samples into floats.
     let rescale = slices[0].rescale;
     let float = slices.iter().any(|s| s.rescale != rescale);
+    if float {
+        notes.push(
+            "each slice has a slope and an intercept of its own; its values became float32".into(),
+        );
+    }
     let number = if float { Number::F32 } else { common_number(slices.iter().map(|s| s.format)) };
     Ok(Preface {
         name,

@@ -79,6 +79,7 @@ pub(crate) fn slice(
     let get = |key: &str, or: &str| {
         more.iter().find(|(k, _)| *k == key).map_or(or, |(_, v)| v).as_bytes().to_vec()
     };
+    put((8, 8), "CS", &get("image_type", "ORIGINAL\\PRIMARY\\AXIAL"));
     put((8, 0x60), "CS", b"CT");
     put((8, 0x103e), "LO", &get("description", "thorax"));
     put((0x18, 0x50), "DS", &get("thickness", "9"));
@@ -88,6 +89,7 @@ pub(crate) fn slice(
     put((0x20, 0x32), "DS", &get("position", &format!("-4\\5\\{z}")));
     put((0x20, 0x37), "DS", &get("orientation", "1\\0\\0\\0\\1\\0"));
     put((0x28, 2), "US", &short(1));
+    put((0x28, 4), "CS", &get("photometric", "MONOCHROME2"));
     put((0x28, 8), "IS", &get("frames", "1"));
     put((0x28, 0x10), "US", &short(pixels.len() as u16 / 3));
     put((0x28, 0x11), "US", &short(3));
@@ -100,6 +102,9 @@ pub(crate) fn slice(
     put((0x28, 0x103), "US", &short(signed));
     put((0x28, 0x1052), "DS", &get("intercept", "-1024"));
     put((0x28, 0x1053), "DS", &get("slope", "1"));
+    if more.iter().any(|(key, _)| *key == "modality_lut") {
+        put((0x28, 0x3000), "SQ", &[0xfe, 0xff, 0, 0xe0, 0, 0, 0, 0]);
+    }
     let words: Vec<u8> = pixels.iter().flat_map(|p| short(*p as u16)).collect();
     if syntax == Syntax::Rle {
         let halves = [1, 0].map(|b| {
@@ -456,4 +461,45 @@ fn bad_file_beside_a_dicom_series_is_left_out_and_noted_and_refused_if_it_is_the
         let e = crate::open(&dir.path().join("bad.dcm")).unwrap_err().to_string();
         assert!(e.contains(say), "{e}");
     }
+}
+
+#[test]
+fn dicom_mosaics_and_tables_of_values_are_refused_and_palettes_said() {
+    let open = |more: &[(&str, &str)]| {
+        let dir = folder(&[("1", slice(Syntax::Explicit, "1", 0.0, &pixels(0), more))]);
+        crate::open_with(dir.path(), &crate::Hints::default()).map_err(|e| e.to_string())
+    };
+    let e = open(&[("image_type", "ORIGINAL\\PRIMARY\\M\\ND\\MOSAIC")]).unwrap_err();
+    assert!(e.contains("`1` ImageType: is MOSAIC") && e.contains("dcm2niix"), "{e}");
+    let e = open(&[("modality_lut", "1")]).unwrap_err();
+    assert!(e.contains("`1` ModalityLUTSequence: gives the values by a table"), "{e}");
+    let notes = open(&[("photometric", "PALETTE COLOR")]).unwrap().notes.join("; ");
+    assert!(notes.contains("the stored indices were read"), "{notes}");
+}
+
+#[test]
+fn folder_above_a_series_is_refused_with_the_folder_below() {
+    let dir = tempfile::tempdir().unwrap();
+    let below = dir.path().join("DICOM/S01");
+    std::fs::create_dir_all(&below).unwrap();
+    for z in 0..3 {
+        let bytes = slice(Syntax::Explicit, "1.2", f64::from(z), &pixels(0), &[]);
+        std::fs::write(below.join(format!("IM{z}")), bytes).unwrap();
+    }
+    let said = "give the folder `DICOM/S01` below it, which holds 3 DICOM files";
+    let e = crate::open(dir.path()).unwrap_err().to_string();
+    assert!(e.ends_with(said), "{e}");
+    // A DICOMDIR has no picture of its own.
+    let mut dicomdir = slice(Syntax::Explicit, "1.2", 0.0, &pixels(0), &[]);
+    dicomdir.truncate(dicomdir.len() - 24);
+    std::fs::write(dir.path().join("DICOMDIR"), dicomdir).unwrap();
+    for path in [dir.path().to_path_buf(), dir.path().join("DICOMDIR")] {
+        let e = crate::open(&path).unwrap_err().to_string();
+        assert!(e.contains("holds DICOM files, but no picture") && e.ends_with(said), "{e}");
+    }
+    std::fs::create_dir(dir.path().join("DICOM/S02")).unwrap();
+    std::fs::copy(below.join("IM0"), dir.path().join("DICOM/S02/IM0")).unwrap();
+    let e = crate::open(dir.path()).unwrap_err().to_string();
+    let said = "give a folder below it: `DICOM/S01` (3 DICOM files), `DICOM/S02` (1 DICOM file)";
+    assert!(e.ends_with(said), "{e}");
 }

@@ -26,6 +26,7 @@ pub(crate) enum Pieces {
     I32(Vec<Vec<i32>>),
     U64(Vec<Vec<u64>>),
     I64(Vec<Vec<i64>>),
+    F32(Vec<Vec<f32>>),
     F64(Vec<Vec<f64>>),
 }
 
@@ -47,7 +48,7 @@ macro_rules! wide {
         }
     )*};
 }
-wide!(u32: U32, i32: I32, u64: U64, i64: I64, f64: F64);
+wide!(u32: U32, i32: I32, u64: U64, i64: I64, f32: F32, f64: F64);
 
 impl FileNumbers {
     pub(crate) fn number(&self) -> Number {
@@ -56,6 +57,7 @@ impl FileNumbers {
             Pieces::I32(_) => Number::I32,
             Pieces::U64(_) => Number::U64,
             Pieces::I64(_) => Number::I64,
+            Pieces::F32(_) => Number::F32,
             Pieces::F64(_) => Number::F64,
         }
     }
@@ -95,6 +97,7 @@ impl FileNumbers {
             Pieces::I32(p) => each!(p),
             Pieces::U64(p) => each!(p),
             Pieces::I64(p) => each!(p),
+            Pieces::F32(p) => each!(p),
             Pieces::F64(p) => each!(p),
         }
         Ok(())
@@ -157,7 +160,7 @@ impl Beside {
     pub(crate) fn filler(&self, value: f64) {
         if !self.keep {
             self.left().notes.push(format!(
-                "the value {value:.4e} stands alone beyond float32 and was taken for none (NaN)"
+                "the value {value:.4e}, far beyond all others, was taken for none (NaN)"
             ));
         }
     }

@@ -12,7 +12,7 @@
 //! | other float64 | f32 in 0..1 | min + c (max - min) |
 //!
 //! A 32-bit integer with a wide range loses its low bits (f32 has 24), as in every renderer that
-//! samples floats. The shift by the minimum keeps the span. A note says so, or the numbers are kept
+//! samples floats. One value far beyond all others (-3e38) stands for none and becomes NaN. The shift by the minimum keeps the span. A note says so, or the numbers are kept
 //! beside the codes ([`crate::numbers`]).
 
 use crate::error::{OpenErrorKind, Problem};
@@ -272,7 +272,7 @@ pub(crate) fn read(
             })?;
             (Samples::U16(v), shifted(-32768.0))
         }
-        Number::F32 => (Samples::F32(data.collect(words!(f32))?), ValueMap::IDENTITY),
+        Number::F32 => wide::without_fillers(data.collect(words!(f32))?, &cap.beside)?,
         Number::U32 => wide::compact_integers(data.collect_pieces(words!(u32))?, &cap.beside)?,
         Number::I32 => wide::compact_integers(data.collect_pieces(words!(i32))?, &cap.beside)?,
         Number::U64 => wide::compact_integers(data.collect_pieces(words!(u64))?, &cap.beside)?,

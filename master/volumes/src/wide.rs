@@ -53,30 +53,69 @@ pub(crate) fn compact_integers<T: Wide + Ord + Into<i128>>(
 
 const F32_MAX: f64 = f32::MAX as f64;
 
+/// Least size of a filler, and how many times it is as large as all other values. Fillers in use are
+/// 1e20, 1e30, 9.97e36 (NetCDF), 3.4e38 and 1.8e308; a hot voxel of an image is smaller. Beside a
+/// factor of 1e9 the others would be one step of f32 (2^24), and pictures show nothing of them.
+const FILLER_MIN: f64 = 1e15;
+const FILLER_RATIO: f64 = 1e9;
+/// Least number of values that tell a filler from a value like others.
+const FILLER_VALUES: usize = 64;
+
+/// Returns the size above which values stand for none; `None` without such. They are one value, with
+/// either sign.
+fn filler_limit(all: impl Iterator<Item = f64>) -> Option<f64> {
+    let (mut first, mut second, mut count) = (0.0f64, 0.0f64, 0);
+    for size in all.map(f64::abs).filter(|size| size.is_finite()) {
+        count += 1;
+        if size > first {
+            (first, second) = (size, first);
+        } else if size > second && size < first {
+            second = size;
+        }
+    }
+    let is_filler = first >= FILLER_MIN && second > 0.0 && first / FILLER_RATIO > second;
+    (is_filler && count >= FILLER_VALUES).then_some(second)
+}
+
+/// Replaces fillers in f32 samples by NaN. Notes them, or keeps the samples.
+pub(crate) fn without_fillers(
+    mut codes: Vec<f32>,
+    beside: &Beside,
+) -> Result<(Samples, ValueMap), Problem> {
+    let map = ValueMap::IDENTITY;
+    let Some(limit) = filler_limit(codes.iter().map(|&v| v.into())) else {
+        return Ok((Samples::F32(codes), map));
+    };
+    let is_filler = |v: &f32| v.is_finite() && f64::from(*v).abs() > limit;
+    if let Some(filler) = codes.iter().copied().find(is_filler) {
+        beside.filler(filler.into());
+    }
+    if beside.keeps() {
+        let mut kept = Vec::new();
+        reserve(&mut kept, codes.len())?;
+        kept.extend_from_slice(&codes);
+        beside.leave(vec![kept], map);
+    }
+    codes.iter_mut().filter(|v| is_filler(v)).for_each(|v| *v = f32::NAN);
+    Ok((Samples::F32(codes), map))
+}
+
 /// Converts doubles to f32 codes; rescales them where f32 would overflow, flush to zero or be too
-/// coarse. Notes by how much they were rounded, or keeps the doubles. A filler beyond f32 becomes
-/// NaN.
+/// coarse. Notes by how much they were rounded, or keeps the doubles. A filler becomes NaN.
 pub(crate) fn compact_doubles(
     pieces: Vec<Vec<f64>>,
     beside: &Beside,
 ) -> Result<(Samples, ValueMap), Problem> {
     let all = || pieces.iter().flatten().copied();
-    let range = |most: f64| {
-        let inside = all().filter(|v| v.abs() <= most);
-        inside.fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), v| (lo.min(v), hi.max(v)))
-    };
-    let (mut lo, mut hi) = range(f64::MAX);
-    // One value alone beyond f32, such as -1.8e308, stands for none. By its range all others would
-    // become one code.
-    let beyond = |v: &f64| v.is_finite() && v.abs() > F32_MAX;
-    let inner = range(F32_MAX);
-    let filler = all()
-        .find(beyond)
-        .filter(|filler| inner.0 <= inner.1 && all().filter(beyond).all(|v| v == *filler));
-    if let Some(filler) = filler {
-        (lo, hi) = inner;
+    // By a filler's range all others would become one code.
+    let limit = filler_limit(all());
+    if let Some(filler) = limit.and_then(|limit| all().find(|v| v.is_finite() && v.abs() > limit)) {
         beside.filler(filler);
     }
+    let limit = limit.unwrap_or(f64::MAX);
+    let inside = all().filter(|v| v.abs() <= limit);
+    let (lo, hi) =
+        inside.fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), v| (lo.min(v), hi.max(v)));
     let map = if lo > hi || f32_keeps_range(lo, hi) {
         ValueMap::IDENTITY
     } else if hi == lo {
@@ -89,7 +128,7 @@ pub(crate) fn compact_doubles(
     };
     let mut most = 0.0f64;
     let codes = convert_beside(pieces, map, beside, |v| {
-        if Some(v) == filler {
+        if v.is_finite() && v.abs() > limit {
             return f32::NAN;
         }
         let code = ((v - map.offset) / map.scale) as f32;

@@ -273,7 +273,7 @@ impl Array {
                 let code = |b: &[u8]| le!(u16)(b) ^ 0x8000;
                 (Samples::U16(self.collect(placed, code)?), shifted(-32768.0))
             }
-            Number::F32 => (Samples::F32(self.collect(placed, le!(f32))?), ValueMap::IDENTITY),
+            Number::F32 => wide::without_fillers(self.collect(placed, le!(f32))?, beside)?,
             // Their range decides the codes, so all are kept in their type first.
             Number::U32 => wide::compact_integers(self.collect_pieces(placed, le!(u32))?, beside)?,
             Number::I32 => wide::compact_integers(self.collect_pieces(placed, le!(i32))?, beside)?,

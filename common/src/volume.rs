@@ -113,6 +113,9 @@ impl Lattice {
         if !self.steps.iter().all(|v| v.is_finite()) || !self.origin.is_finite() {
             return Err(LatticeError::NotFinite);
         }
+        if s.iter().any(|x| x.is_infinite()) {
+            return Err(LatticeError::HugeSpacing);
+        }
         if s.iter().any(|&x| x <= 0.0 || !x.is_normal()) {
             return Err(LatticeError::ZeroSpacing(s));
         }
@@ -140,6 +143,9 @@ pub enum LatticeError {
     /// A step has no length, or a denormal one. Holds the spacings in world units.
     #[error("a spacing is zero or too small ({0:?})")]
     ZeroSpacing([f64; 3]),
+    /// A step is so long that its square is no number.
+    #[error("a spacing is too large (above 1e154)")]
+    HugeSpacing,
     /// Two index axes coincide.
     #[error("two index axes point the same way; the volume would be flat")]
     Flat,

@@ -1,6 +1,5 @@
 //! `slabcast convert`: a volume of any format as NRRD or NIfTI.
 
-use slabcast_common::volume::Volume;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress::{self, Progress};
 use slabcast_session::{output, signals, volume};
@@ -12,7 +11,8 @@ use std::path::{Path, PathBuf};
 /// Values, place and orientation stay.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
-The file is whole or not there. Values keep their type; where they have a slope, NRRD gets floats.
+The file is whole or not there. Numbers keep type and value, to the bit; where they have a slope that
+the output can't hold, their values are written as float64, which a note says.
 
 Examples:
   slabcast convert scan.mha scan.nii.gz
@@ -78,27 +78,38 @@ pub(crate) fn run(args: &ConvertArgs) -> Result<(), Fail> {
     let mut bar = Progress::new(args.quiet).counting("slice");
     bar.phase(&format!("reading {}", args.volume.display()));
     let (input, file) = (args.input.clone(), args.volume.clone());
-    let volume = signals::run_unless_stopped(move || input.open(&file))?;
+    let (volume, numbers) = signals::run_unless_stopped(move || input.open_numbers(&file))?;
     if let Some(lost) = write::loss_warning(&volume, format) {
         progress::warn(&lost);
     }
+    if let Some(note) = write::type_note(&volume, numbers.as_ref(), format) {
+        progress::note(&note);
+    }
     let (to, what) = (args.output.clone(), format!("writing {shown}"));
-    let bytes = signals::run_to_end(move || write_to(&to, &volume, format, bar, &what))?;
+    let bytes = signals::run_to_end(move || {
+        let write = |out: &mut dyn std::io::Write, went_on: &mut WentOn<'_>| {
+            write::write(&volume, numbers.as_ref(), format, out, went_on)
+        };
+        write_to(&to, volume.lattice.dims, write, bar, &what)
+    })?;
     if args.quiet {
         return Ok(());
     }
     say(&format!("{shown}: {}\n", progress::bytes(bytes)))
 }
 
+/// Hears how many samples are written.
+type WentOn<'a> = dyn FnMut(u64) -> std::io::Result<()> + 'a;
+
 /// Writes the file; gives its bytes.
 fn write_to(
     path: &Path,
-    volume: &Volume,
-    format: Format,
+    dims: [u32; 3],
+    write: impl Fn(&mut dyn std::io::Write, &mut WentOn<'_>) -> std::io::Result<()>,
     mut bar: Progress,
     what: &str,
 ) -> Result<u64, Fail> {
-    let [nx, ny, nz] = volume.lattice.dims.map(u64::from);
+    let [nx, ny, nz] = dims.map(u64::from);
     bar.frames(nz, what);
     let mut went_on = |samples: u64| {
         bar.step(progress::Step { frames: samples / (nx * ny), ..Default::default() });
@@ -107,7 +118,7 @@ fn write_to(
             false => Ok(()),
         }
     };
-    output::write_atomic(path, |out| write::write(volume, format, out, &mut went_on))?;
+    output::write_atomic(path, |out| write(out, &mut went_on))?;
     bar.end();
     std::fs::metadata(path).map(|m| m.len()).map_err(|e| Fail::io(path, "looking at it", &e))
 }

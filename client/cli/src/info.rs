@@ -224,7 +224,10 @@ fn text(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
         },
     );
     let (lo, hi) = s.range();
-    let mut values = format!("{} to {}", number(lo), number(hi));
+    let mut values = match s.total() == s.nan + s.infinite {
+        true => "none that is finite".to_string(),
+        false => format!("{} to {}", number(lo), number(hi)),
+    };
     // A shift alone is how signed numbers are stored: nothing to tell.
     if s.map.scale != 1.0 {
         let _ = write!(

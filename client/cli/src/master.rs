@@ -49,7 +49,8 @@ const MEMORY: u64 = 512 << 20;
 
 /// Serves volumes to workers and takes jobs from clients.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = MASTER_EXAMPLES)]
+// `--volume` is the file here.
+#[command(after_help = MASTER_EXAMPLES, mut_arg("nth_volume", |a| a.long("nth-volume")))]
 pub(crate) struct MasterArgs {
     #[arg(long, value_name = "FILE", help = volume::VOLUME)]
     volume: Option<PathBuf>,

@@ -2,6 +2,7 @@
 //! limits.
 
 use slabcast_session::fail::Fail;
+use slabcast_session::volume::PickArgs;
 use std::path::PathBuf;
 
 /// Parses a folder of DICOM for another process of ours, within limits: series and samples to
@@ -19,14 +20,17 @@ pub(crate) struct DicomArgs {
     /// A slice of the series
     #[arg(long)]
     file: Option<PathBuf>,
+    #[command(flatten)]
+    pick: PickArgs,
 }
 
 /// Runs the hidden command: series and samples to stdout.
 #[cfg(feature = "dicom")]
 pub(crate) fn run(args: &DicomArgs) -> Result<(), Fail> {
     let mut out = std::io::BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
-    let DicomArgs { folder, series, file } = args;
-    slabcast_volumes::dicom::serve(folder, series.as_deref(), file.as_deref(), &mut out)
+    let DicomArgs { folder, series, file, pick } = args;
+    let (series, file) = (series.as_deref(), file.as_deref());
+    slabcast_volumes::dicom::serve(folder, series, file, pick.pick(), &mut out)
         .map_err(|e| Fail::failed(e.to_string()))
 }
 

@@ -5,7 +5,7 @@ use crate::fail::Fail;
 use crate::parse;
 use crate::progress;
 use slabcast_common::volume::Volume;
-use slabcast_volumes::{Hints, OpenError, Opened, RawHints};
+use slabcast_volumes::{FileNumbers, Hints, OpenError, Opened, Pick, RawHints};
 use std::ffi::OsString;
 use std::path::Path;
 
@@ -52,6 +52,35 @@ pub struct InputArgs {
     #[arg(long, value_name = "BYTES", value_parser = parse::memory, help_heading = HEADING,
           hide_short_help = true)]
     max_bytes: Option<u64>,
+    #[command(flatten)]
+    pick: PickArgs,
+}
+
+/// Flags that take one volume of a file with several.
+#[derive(clap::Args, Clone, Debug, Default, PartialEq)]
+pub struct PickArgs {
+    /// Which volume of a file with several, 0 the first, in the file's order [default: 0]
+    #[arg(long = "volume", id = "nth_volume", value_name = "N", allow_negative_numbers = true,
+          conflicts_with_all = ["nth_time", "nth_channel"], help_heading = HEADING,
+          hide_short_help = true)]
+    volume: Option<u64>,
+    /// Which time or echo, 0 the first [default: 0]
+    #[arg(long = "time", id = "nth_time", value_name = "N", allow_negative_numbers = true,
+          help_heading = HEADING,
+          hide_short_help = true)]
+    time: Option<u64>,
+    /// Which channel, colour or component, 0 the first [default: 0 of channels]
+    #[arg(long = "channel", id = "nth_channel", value_name = "N", allow_negative_numbers = true,
+          help_heading = HEADING,
+          hide_short_help = true)]
+    channel: Option<u64>,
+}
+
+impl PickArgs {
+    /// Returns what the flags ask for.
+    pub fn pick(&self) -> Pick {
+        Pick { volume: self.volume, time: self.time, channel: self.channel }
+    }
 }
 
 const HEADING: &str = "Input (what the file does not say itself)";
@@ -70,6 +99,8 @@ impl InputArgs {
             dicom_reader: dicom_reader(),
             level: self.level,
             max_bytes: self.max_bytes,
+            pick: self.pick.pick(),
+            ..Hints::default()
         }
     }
 
@@ -86,6 +117,18 @@ impl InputArgs {
         let opened = open_with(path, &self.hints())?;
         opened.notes.iter().for_each(|note| progress::note(note));
         Ok(opened.volume)
+    }
+
+    /// Opens a volume like [`InputArgs::open`], to write it: with the file's own numbers where the
+    /// volume's codes round them.
+    ///
+    /// # Errors
+    /// Those of [`InputArgs::open`].
+    pub fn open_numbers(&self, path: &Path) -> Result<(Volume, Option<FileNumbers>), Fail> {
+        let opened = slabcast_volumes::open_numbers(path, &self.hints());
+        let (opened, numbers) = opened.map_err(|e| Fail::failed(e.to_string()))?;
+        opened.notes.iter().for_each(|note| progress::note(note));
+        Ok((opened.volume, numbers))
     }
 }
 

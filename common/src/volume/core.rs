@@ -38,8 +38,9 @@ pub(super) fn find(samples: &Samples, s: &ValueSummary) -> Option<ValueCore> {
         let negative = padded && s.map.value(lo) < 0.0;
         let (first, last) = trimmed(&histogram, negative);
         let bin = (hi - lo) / 256.0;
-        let ends = (lo + bin * first as f64, lo + bin * (last + 1) as f64);
-        let (a, b) = (ends.0.max(s.min_code), ends.1.min(s.max_code));
+        // An end that stays is not computed: beside -3e38 the sum would be 0, not 1000.
+        let a = if first == 0 { lo } else { (lo + bin * first as f64).max(s.min_code) };
+        let b = if last == 255 { hi } else { (lo + bin * (last + 1) as f64).min(s.max_code) };
         if b - a > NARROW * (hi - lo) || b <= a {
             break;
         }
@@ -119,7 +120,14 @@ mod tests {
 
     #[test]
     fn one_hot_voxel_and_padding_lie_beyond_the_core() {
-        for far in [vec![30_000.0], vec![1e30], vec![-32768.0; 20_000], vec![-1e30, 1e30]] {
+        for far in [
+            vec![30_000.0],
+            vec![1e30],
+            vec![-3e38],
+            vec![3e38],
+            vec![-32768.0; 20_000],
+            vec![-1e30, 1e30],
+        ] {
             let found = core([body(), far.clone()].concat()).unwrap_or_else(|| panic!("{far:?}"));
             assert!((-250.0..=1.0).contains(&found.min_code), "{far:?}: {}", found.min_code);
             assert!((1990.0..4000.0).contains(&found.max_code), "{far:?}: {}", found.max_code);

@@ -58,3 +58,11 @@ fn summary_counts_the_unusual() {
     let empty = ValueSummary::from_samples(&Samples::F32(vec![f32::NAN]), ValueMap::IDENTITY);
     assert_eq!(empty.range(), (0.0, 0.0));
 }
+
+#[test]
+fn spacing_too_large_for_a_number_is_not_called_zero() {
+    let lattice = Lattice::from_spacing([2; 3], [1e300; 3]);
+    let e = lattice.check().unwrap_err();
+    assert_eq!(e, LatticeError::HugeSpacing);
+    assert!(e.to_string().contains("too large"), "{e}");
+}

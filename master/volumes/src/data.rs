@@ -3,6 +3,7 @@
 
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::limit::ByteCap;
+use crate::pick::Part;
 use crate::samples::{self, DIM_MAX, Layout, SKIP_MAX_BYTES, Supply};
 use crate::source::{self, Folder, Notes, Source};
 use crate::unpack::{Encoding, wrapped};
@@ -78,39 +79,83 @@ pub(crate) struct Storage {
     pub(crate) skip_field: &'static str,
 }
 
-/// Reads the samples from a source at the start of its `len` bytes of data.
+/// Reads the samples from a source at the start of its `len` bytes of data. `part` says which of the
+/// file's samples they are, if they are not all.
 pub(crate) fn read(
     source: Source,
     len: u64,
     storage: &Storage,
     layout: &Layout,
+    part: Option<&Part>,
 ) -> Result<(Samples, ValueMap), Problem> {
-    let cap = source.cap;
-    let (mut reader, supply) = open(source, len, storage, layout, layout.bytes())?;
-    samples::read(&mut *reader, supply, &storage.decoded_layout(layout), cap)
+    let cap = source.cap.clone();
+    let layout_of_file = storage.decoded_layout(layout);
+    let Some(part) = part else {
+        let (mut reader, supply) = open(source, len, storage, layout, layout.bytes())?;
+        return samples::read(&mut *reader, supply, &layout_of_file, cap);
+    };
+    let whole = part.whole_bytes();
+    if storage.encoding == Encoding::Raw && part.is_run() {
+        // What lies before is not read.
+        let start = part.start();
+        let skip = match storage.byte_skip {
+            Skip::Bytes(skip) if len.saturating_sub(skip) < part.end() => {
+                return Err(samples::truncated(part.end(), len.saturating_sub(skip)));
+            }
+            Skip::Bytes(skip) => Skip::Bytes(skip + start),
+            Skip::FromEnd => Skip::FromEnd,
+        };
+        let storage = Storage { byte_skip: skip, ..*storage };
+        // `FromEnd` leaves as many bytes as are asked for.
+        let share = if skip == Skip::FromEnd { whole - start } else { layout.bytes() };
+        let (mut reader, supply) = open(source, len, &storage, layout, share)?;
+        return samples::read(&mut *reader, supply, &layout_of_file, cap);
+    }
+    let (reader, supply) = open(source, len, storage, layout, whole)?;
+    read_part(reader, supply, part, &layout_of_file, cap)
+}
+
+/// Reads a part of the samples that `reader` gives.
+pub(crate) fn read_part(
+    reader: impl Read + Send,
+    supply: Supply,
+    part: &Part,
+    layout: &Layout,
+    cap: ByteCap,
+) -> Result<(Samples, ValueMap), Problem> {
+    let (end, need) = (part.end(), layout.bytes());
+    let supply = match supply {
+        Supply::Plain { have } if have < end => return Err(samples::truncated(end, have)),
+        Supply::Plain { .. } => Supply::Plain { have: need },
+        Supply::Encoded { bytes, ratio, .. } if end / ratio > bytes => {
+            return Err(samples::truncated(end, bytes.saturating_mul(ratio)));
+        }
+        encoded => encoded,
+    };
+    samples::read(&mut part.reader(reader), supply, layout, cap)
 }
 
 /// Reads the samples from files in the header's folder or below it; each holds an equal share.
 /// `field` is the header's name for the files, `cap` the limit of their bytes together; notes on
-/// padding go to `notes`.
+/// padding go to `notes`. `part` says which of the files' samples are read, if not all.
 pub(crate) fn read_files(
     folder: &Path,
     (names, field): (&[String], &str),
     (cap, notes): (ByteCap, &Notes),
     storage: &Storage,
-    layout: &Layout,
+    (layout, part): (&Layout, Option<&Part>),
 ) -> Result<(Samples, ValueMap), Problem> {
     let in_file = |name: &str| format!("{field} {}", quoted(name));
     let folder = Folder::open(folder, field)?;
     if let [name] = names {
         let source = Source { cap, notes: notes.clone(), ..folder.named(name, field)? };
         let len = source.len;
-        return read(source, len, storage, layout).map_err(|mut p| {
+        return read(source, len, storage, layout, part).map_err(|mut p| {
             p.field = in_file(name);
             p
         });
     }
-    let need = layout.bytes();
+    let need = part.map_or(layout.bytes(), Part::whole_bytes);
     if names.is_empty() || names.len() as u64 > DIM_MAX || !need.is_multiple_of(names.len() as u64)
     {
         return Err(Problem::malformed(
@@ -144,12 +189,17 @@ pub(crate) fn read_files(
             ) => Supply::Encoded { name, bytes: before + bytes, ratio },
             (Some(encoded), Supply::Plain { .. }) => encoded,
         });
-        parts.push_back(Part { shown: in_file(name), name });
+        parts.push_back(ListedFile { shown: in_file(name), name });
     }
     let supply = total.expect("there is a file");
     let mut files =
         FileChain { folder: &folder, parts, storage, layout, share, notes, current: None };
-    samples::read(&mut files, supply, &storage.decoded_layout(layout), cap).map_err(|mut p| {
+    let layout = storage.decoded_layout(layout);
+    let read = match part {
+        Some(part) => read_part(files, supply, part, &layout, cap),
+        None => samples::read(&mut files, supply, &layout, cap),
+    };
+    read.map_err(|mut p| {
         if p.field == "data" {
             p.field = field.into();
         }
@@ -232,7 +282,7 @@ fn open<'a>(
     Ok((reader, supply))
 }
 
-struct Part<'a> {
+struct ListedFile<'a> {
     /// The field and the file's name, for messages.
     shown: String,
     /// Name in the folder.
@@ -242,7 +292,7 @@ struct Part<'a> {
 /// Reads files one after another; each is opened when its turn comes.
 struct FileChain<'a> {
     folder: &'a Folder,
-    parts: VecDeque<Part<'a>>,
+    parts: VecDeque<ListedFile<'a>>,
     storage: &'a Storage,
     layout: &'a Layout,
     /// Bytes of samples in each file.
@@ -256,7 +306,7 @@ impl Read for FileChain<'_> {
     fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
         loop {
             let Some((name, reader, left)) = &mut self.current else {
-                let Some(Part { shown: name, name: file }) = self.parts.pop_front() else {
+                let Some(ListedFile { shown: name, name: file }) = self.parts.pop_front() else {
                     return Ok(0);
                 };
                 let name_file = |mut p: Problem| {

@@ -31,7 +31,7 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     {
         let slices = matching(dicom::sniff);
         if !slices.is_empty() {
-            return dicom::open(&slices, folder, hints, None);
+            return dicom::open(&slices, folder, hints, None).map_err(|p| point_below(folder, p));
         }
     }
     let tiffs = matching(tiff_stack::sniff);
@@ -63,7 +63,7 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
         return Ok(opened);
     }
     let remedy = match &volumes[..] {
-        [] => return Err(no_volume(folder, &files)),
+        [] => return Err(point_below(folder, no_volume(folder, &files))),
         [one] => format!("give the file {one} in it"),
         [one, two, ..] => format!("give one file in it, such as {one} or {two}"),
     };
@@ -75,6 +75,69 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
         false => ("holds no slices or pictures", remedy),
     };
     Err(Problem::new(OpenErrorKind::NotAVolume, "folder", what, remedy))
+}
+
+/// Most folders looked into, and the deepest level, below one without a picture: a CD has some
+/// hundred, three deep.
+const BELOW_MAX: usize = 2000;
+const DEPTH_MAX: usize = 6;
+
+/// Names in a remedy the folders below that hold slices or pictures, if the folder has none itself.
+fn point_below(folder: &Path, problem: Problem) -> Problem {
+    if problem.kind != OpenErrorKind::NotAVolume {
+        return problem;
+    }
+    let mut waiting = std::collections::VecDeque::from([(folder.to_path_buf(), 0)]);
+    let (mut found, mut seen) = (Vec::new(), 0);
+    while let Some((at, depth)) = waiting.pop_front()
+        && seen < BELOW_MAX
+        && found.len() < 6
+    {
+        seen += 1;
+        let Ok(entries) = std::fs::read_dir(&at) else { continue };
+        // Links are not followed: one may lead anywhere.
+        let mut entries: Vec<_> =
+            entries.flatten().filter_map(|e| Some((e.path(), e.file_type().ok()?))).collect();
+        entries.sort_by(|a, b| tiff_stack::compare_by_number(&a.0, &b.0));
+        let (mut dicom_files, mut picture_files) = (0u64, 0u64);
+        for (path, kind) in entries.into_iter().take(FILES_MAX) {
+            if kind.is_dir() && depth < DEPTH_MAX {
+                waiting.push_back((path, depth + 1));
+            } else if kind.is_file() && depth > 0 {
+                let mut head = Vec::new();
+                if let Ok(file) = std::fs::File::open(&path) {
+                    let _ = file.take(136).read_to_end(&mut head);
+                }
+                dicom_files += u64::from(is_dicom(&head));
+                let picture = [tiff_stack::sniff, pictures::is_png, pictures::is_jpeg];
+                picture_files += u64::from(picture.iter().any(|sniff| sniff(&head)));
+            }
+        }
+        let name = at.strip_prefix(folder).unwrap_or(&at).to_string_lossy().into_owned();
+        let count = |n: u64, what: &str| format!("{n} {what}{}", if n == 1 { "" } else { "s" });
+        match (dicom_files, picture_files) {
+            (0, 0) => {}
+            (0, n) => found.push((quoted(&name), count(n, "picture"))),
+            (n, _) => found.push((quoted(&name), count(n, "DICOM file"))),
+        }
+    }
+    let remedy = match &found[..] {
+        [] => return problem,
+        [(name, holds)] => format!("give the folder {name} below it, which holds {holds}"),
+        several => {
+            let list: Vec<String> =
+                several.iter().map(|(name, holds)| format!("{name} ({holds})")).collect();
+            format!("give a folder below it: {}", list.join(", "))
+        }
+    };
+    Problem { remedy, ..problem }
+}
+
+fn is_dicom(head: &[u8]) -> bool {
+    #[cfg(feature = "dicom")]
+    return dicom::sniff(head);
+    #[cfg(not(feature = "dicom"))]
+    return head.get(128..132) == Some(b"DICM");
 }
 
 /// Returns the error for a folder without volumes, which names what is in it if that is known.
@@ -114,7 +177,9 @@ pub(crate) fn open_series_of(file: &Path, hints: &Hints) -> Result<Opened, Probl
     // Spelt as in the folder's list, which is compared with it.
     let file = folder.join(file.file_name().unwrap_or_default());
     let slices = dicom_files(folder)?;
-    let mut opened = dicom::open(&slices, folder, hints, hints.series.is_none().then_some(&*file))?;
+    let file_given = hints.series.is_none().then_some(&*file);
+    let mut opened =
+        dicom::open(&slices, folder, hints, file_given).map_err(|p| point_below(folder, p))?;
     let name = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let count = opened.volume.lattice.dims[2];
     if count > 1 && slices.len() > 1 {

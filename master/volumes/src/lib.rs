@@ -58,8 +58,10 @@ mod mrc;
 mod nifti;
 mod npy;
 mod nrrd;
+mod numbers;
 #[cfg(test)]
 mod phantom;
+mod pick;
 mod pictures;
 mod plain;
 mod prefilter;
@@ -80,6 +82,8 @@ pub mod write;
 mod zarr;
 
 pub use error::{OpenError, OpenErrorKind, Problem};
+pub use numbers::{Beside, FileNumbers};
+pub use pick::Pick;
 pub use raw::RawHints;
 pub use sketch::histogram_sketch;
 pub use store::BrickStore;
@@ -114,6 +118,10 @@ pub struct Hints {
     /// Most bytes that the samples may have, in the file's type. `None` allows 1 GiB or 64 times
     /// the file's bytes, whichever is more, within three quarters of the free memory.
     pub max_bytes: Option<u64>,
+    /// Which volume of a file with several; the first by default.
+    pub pick: Pick,
+    /// What readers leave beside a volume; each opening has its own, so leave the default.
+    pub beside: Beside,
 }
 
 impl Hints {
@@ -130,7 +138,7 @@ impl Hints {
     }
 
     fn cap(&self) -> ByteCap {
-        ByteCap { asked: self.max_bytes }
+        ByteCap { asked: self.max_bytes, beside: self.beside.clone() }
     }
 }
 
@@ -160,12 +168,33 @@ pub fn open(path: &Path) -> Result<Volume, OpenError> {
 /// Those of [`open`]. Also hints that contradict the file: a type or spacing for a file with a
 /// header, an unknown series or level, sizes that do not match the file's length.
 pub fn open_with(path: &Path, hints: &Hints) -> Result<Opened, OpenError> {
+    open_beside(path, &Hints { beside: Beside::new(false), ..hints.clone() })
+}
+
+/// Opens a volume like [`open_with`], to write it: also returns the file's own numbers where the
+/// volume's codes round them (integers of 32 and 64 bits, float64). These take up to 8 bytes a
+/// sample beside the volume.
+///
+/// # Errors
+/// Those of [`open_with`].
+pub fn open_numbers(
+    path: &Path,
+    hints: &Hints,
+) -> Result<(Opened, Option<FileNumbers>), OpenError> {
+    let hints = Hints { beside: Beside::new(true), ..hints.clone() };
+    let opened = open_beside(path, &hints)?;
+    Ok((opened, hints.beside.take_numbers()))
+}
+
+fn open_beside(path: &Path, hints: &Hints) -> Result<Opened, OpenError> {
     let shown = path.to_string_lossy();
-    let volume = match shown.strip_prefix(formula::PREFIX) {
+    let opened = match shown.strip_prefix(formula::PREFIX) {
         Some(_) => formula::open(&shown).map(Opened::from),
         None => open_file(path, hints),
     };
-    volume.map_err(|problem| OpenError { file: shown.into_owned(), problem })
+    let mut opened = opened.map_err(|problem| OpenError { file: shown.into_owned(), problem })?;
+    opened.notes.extend(hints.beside.take_notes());
+    Ok(opened)
 }
 
 impl From<Volume> for Opened {
@@ -253,6 +282,7 @@ fn read_noted(
 ) -> Result<Opened, Problem> {
     if tiff_stack::sniff(source.head()?) && hints.raw.dims.is_none() {
         hints.check_no_dataset()?;
+        source.pick = hints.pick;
         return tiff_stack::read(source, name, &hints.raw);
     }
     read(source, folder, name, hints).map(Opened::from)
@@ -260,6 +290,7 @@ fn read_noted(
 
 /// Reads a volume; its first bytes decide the format. `folder` is where detached data may lie.
 fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<Volume, Problem> {
+    source.pick = hints.pick;
     let head = source.head()?;
     if head.is_empty() {
         return Err(Problem::new(OpenErrorKind::NotAVolume, "content", "is empty", READS));
@@ -267,6 +298,7 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
     // With --dims the file is raw numbers, whatever its content looks like.
     if hints.raw.dims.is_some() {
         let gzip = head.starts_with(GZIP);
+        hints.pick.choose(&[], "content")?;
         return raw::read(source, gzip, name, &hints.raw);
     }
     let gzip = head.starts_with(GZIP);
@@ -315,6 +347,7 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
         return metaimage::read(source, folder, name);
     }
     if vti::sniff(head) {
+        hints.pick.choose(&[], "content")?;
         return vti::read(source, name);
     }
     if tiff_stack::sniff(head) {

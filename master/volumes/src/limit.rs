@@ -12,6 +12,7 @@
 //! place of both.
 
 use crate::error::{OpenErrorKind, Problem};
+use crate::numbers::Beside;
 
 /// Bytes of samples that any file may become, however small it is.
 const ANY_FILE_BYTES: u64 = 1 << 30;
@@ -22,11 +23,13 @@ const SMALL_BYTES: u64 = 64 << 20;
 /// Free memory to assume where the system does not tell.
 const FREE_MEMORY_BYTES: u64 = 4 << 30;
 
-/// The limit that the user gave, or the default.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// The limit that the user gave, or the default, and where numbers go that codes do not hold.
+#[derive(Clone, Debug, Default)]
 pub(crate) struct ByteCap {
     /// `--max-bytes`; `None` for the default.
     pub(crate) asked: Option<u64>,
+    /// Numbers and notes that readers leave beside the samples.
+    pub(crate) beside: Beside,
 }
 
 impl ByteCap {
@@ -35,14 +38,14 @@ impl ByteCap {
     ///
     /// # Errors
     /// [`OpenErrorKind::TooLarge`], with the figures and the flag.
-    pub(crate) fn check(self, need: u64, stored: u64, field: &str) -> Result<(), Problem> {
+    pub(crate) fn check(&self, need: u64, stored: u64, field: &str) -> Result<(), Problem> {
         self.check_within(need, stored, field, free_memory)
     }
 
     /// Returns the bytes of files that are enough for samples of `need` bytes: more would change
     /// nothing. 0 if any file may become so much.
     #[cfg(feature = "zarr")]
-    pub(crate) fn stored_for(self, need: u64) -> u64 {
+    pub(crate) fn stored_for(&self, need: u64) -> u64 {
         match self.asked.is_some() || need <= ANY_FILE_BYTES {
             true => 0,
             false => need.div_ceil(FILE_RATIO),
@@ -50,7 +53,7 @@ impl ByteCap {
     }
 
     fn check_within(
-        self,
+        &self,
         need: u64,
         stored: u64,
         field: &str,
@@ -80,9 +83,11 @@ impl ByteCap {
             ));
         }
         let room = if need > SMALL_BYTES { free() / 4 * 3 } else { u64::MAX };
-        if need > room {
+        // Kept numbers lie beside as many codes of half their bytes, or as many.
+        let held = if self.beside.keeps() { need.saturating_mul(2) } else { need };
+        if held > room {
             return refused(format!(
-                "{need} bytes of samples are more than the {room} that are three quarters of the \
+                "{held} bytes of samples are more than the {room} that are three quarters of the \
                  free memory"
             ));
         }
@@ -134,7 +139,7 @@ mod tests {
 
     #[test]
     fn small_file_that_becomes_gigabytes_is_refused_with_figure_and_flag() {
-        let cap = |asked| ByteCap { asked };
+        let cap = |asked| ByteCap { asked, ..ByteCap::default() };
         let check = |asked, need, stored| {
             cap(asked).check_within(need, stored, "sizes", || 20 * GIB).map_err(|p| p.to_string())
         };

@@ -8,6 +8,7 @@
 
 use crate::data::{self, HeaderLines, Skip, Storage};
 use crate::error::{Problem, quoted};
+use crate::pick::{Axis, Kind, Part, Pick};
 use crate::samples::{Endian, Layout, Number};
 use crate::source::{Notes, Source};
 use crate::unpack::Encoding;
@@ -47,17 +48,18 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 /// must lie.
 pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volume, Problem> {
     let (fields, header_bytes) = Fields::read(&mut source)?;
-    let layout = layout(&fields)?;
+    let (layout, sizes, part) = layout(&fields, source.pick, &source.notes)?;
     let (lattice, anatomical) = lattice(&fields, layout.dims, &source.notes)?;
     let storage = storage(&fields)?;
-    let (samples, map) = match data_files(&fields, layout.dims)? {
+    let (samples, map) = match data_files(&fields, &sizes)? {
         None => {
             let len = source.len.saturating_sub(header_bytes);
-            data::read(source, len, &storage, &layout)?
+            data::read(source, len, &storage, &layout, part.as_ref())?
         }
         Some(names) => {
             let names = (&names[..], "ElementDataFile");
-            data::read_files(folder, names, (source.cap, &source.notes), &storage, &layout)?
+            let layout = (&layout, part.as_ref());
+            data::read_files(folder, names, (source.cap, &source.notes), &storage, layout)?
         }
     };
     Ok(Volume::new(name, layout.number.name(), anatomical, lattice, samples, map))
@@ -161,22 +163,26 @@ impl Fields {
     }
 }
 
-fn layout(fields: &Fields) -> Result<Layout, Problem> {
+/// Returns the layout of the volume that is read, the sizes of all axes of the file, and which part
+/// of its samples is read, if not all.
+fn layout(
+    fields: &Fields,
+    pick: Pick,
+    notes: &Notes,
+) -> Result<(Layout, Vec<u64>, Option<Part>), Problem> {
     if let Some((key, value)) = fields.get(&["ObjectType"])
         && !value.eq_ignore_ascii_case("image")
     {
         return Err(fields.bad(key, "is not an image", "give a MetaImage of ObjectType Image"));
     }
     let axes = axes(fields)?;
-    if let Some((key, value)) = fields.get(&["ElementNumberOfChannels"])
-        && value.parse() != Ok(1u32)
-    {
-        return Err(fields.bad(
-            key,
-            "is not 1: a voxel is not a single number",
-            "save one channel",
-        ));
-    }
+    let channels = match fields.get(&["ElementNumberOfChannels"]) {
+        None => 1,
+        Some((key, value)) => match value.parse() {
+            Ok(n @ 1u64..) => n,
+            _ => return Err(fields.bad(key, "is not a number of channels", "correct it")),
+        },
+    };
     let number = match fields.required("ElementType", "MET_SHORT")?.to_ascii_uppercase().as_str() {
         "MET_CHAR" => Number::I8,
         "MET_UCHAR" => Number::U8,
@@ -211,18 +217,33 @@ fn layout(fields: &Fields) -> Result<Layout, Problem> {
         return Err(fields.bad("DimSize", &format!("is not {axes} whole numbers"), "correct it"));
     }
     let (dims, more) = sizes.split_first_chunk::<3>().expect("there are three axes or more");
-    if more.iter().any(|&n| n != 1) {
-        return Err(fields.bad(
-            "DimSize",
-            "is more than one volume",
-            "save one volume of it with three axes",
-        ));
+    let layout = Layout::new(*dims, number, endian, "DimSize")?;
+    let numbers = Axis::new(Kind::Channel, "numbers", channels);
+    let mut others = vec![Axis { of_voxel: true, ..numbers }];
+    let along = |(i, &n): (usize, &u64)| match more.len() {
+        1 => Axis::new(Kind::Other, "volumes", n),
+        _ => Axis::new(Kind::Other, format!("along axis {}", i + 4), n),
+    };
+    others.extend(more.iter().enumerate().map(along));
+    if more.contains(&0) {
+        return Err(fields.bad("DimSize", "has no samples", "every size must be 1 or more"));
     }
-    let dims = *dims;
-    Layout::new(dims, number, endian, "DimSize")
+    let field = if channels > 1 { "ElementNumberOfChannels" } else { "DimSize" };
+    let (at, said) = pick.choose(&others, field)?;
+    said.into_iter().for_each(|note| notes.add(note));
+    if others.iter().all(|axis| axis.size == 1) {
+        return Ok((layout, sizes, None));
+    }
+    let mut at = at.into_iter().map(Some).collect::<Vec<_>>();
+    at.splice(1..1, [None; 3]);
+    let all: Vec<u64> = std::iter::once(channels).chain(sizes.iter().copied()).collect();
+    match Part::new(&all, at, number.bytes()) {
+        Some(part) => Ok((layout, sizes, Some(part))),
+        None => Err(fields.bad("DimSize", "has more samples than can be", "correct it")),
+    }
 }
 
-/// Returns the number of axes. Those after the third have one sample.
+/// Returns the number of axes. Volumes lie along those after the third.
 fn axes(fields: &Fields) -> Result<usize, Problem> {
     match fields.required("NDims", "3")?.parse() {
         Ok(axes @ 3..=16) => Ok(axes),
@@ -261,17 +282,18 @@ fn storage(fields: &Fields) -> Result<Storage, Problem> {
 }
 
 /// Returns the data files of `LOCAL` (`None`), one name, `LIST [axes]` with a name on each
-/// following line, or `name%03d.raw min max step`. By default a file of a list holds one slice.
-fn data_files(fields: &Fields, dims: [u32; 3]) -> Result<Option<Vec<String>>, Problem> {
+/// following line, or `name%03d.raw min max step`. By default a file of a list holds all axes but the
+/// last.
+fn data_files(fields: &Fields, sizes: &[u64]) -> Result<Option<Vec<String>>, Problem> {
     let value = fields.required("ElementDataFile", "LOCAL")?;
     let bad = |why: &str, remedy: &str| Err(fields.bad(DATA_FILE, why, remedy));
     let words: Vec<&str> = value.split_ascii_whitespace().collect();
     let (names, axes) = match words[..] {
         [] => return bad("is empty", "give LOCAL or name the data file"),
         [word] if word.eq_ignore_ascii_case("local") => return Ok(None),
-        ["LIST"] => (fields.list.clone(), 2),
+        ["LIST"] => (fields.list.clone(), sizes.len() - 1),
         ["LIST", axes] => match axes.trim_end_matches(['d', 'D']).parse() {
-            Ok(axes @ 1..=3) => (fields.list.clone(), axes),
+            Ok(axes) if (1..=sizes.len()).contains(&axes) => (fields.list.clone(), axes),
             _ => return bad("has no number of axes", "give LIST, or LIST 2"),
         },
         [pattern, ref range @ ..]
@@ -283,7 +305,9 @@ fn data_files(fields: &Fields, dims: [u32; 3]) -> Result<Option<Vec<String>>, Pr
                 range.get(i).map_or(default, |w| w.parse().unwrap_or(default))
             };
             // In MetaIO, min alone means one file for each slice.
-            let max = n(1, n(0, 0).saturating_add(i64::from(dims[2]) - 1));
+            let slices = sizes[2..].iter().fold(1u64, |n, &size| n.saturating_mul(size));
+            let slices = i64::try_from(slices).unwrap_or(i64::MAX);
+            let max = n(1, n(0, 0).saturating_add(slices - 1));
             match data::numbered_names(pattern, n(0, 0), max, n(2, 1)) {
                 Some(names) => (names, 2),
                 None => {
@@ -296,7 +320,7 @@ fn data_files(fields: &Fields, dims: [u32; 3]) -> Result<Option<Vec<String>>, Pr
         }
         _ => return Ok(Some(vec![value.to_string()])),
     };
-    let want = dims[axes..].iter().map(|&n| u64::from(n)).product::<u64>();
+    let want = sizes[axes..].iter().fold(1u64, |n, &size| n.saturating_mul(size));
     if names.len() as u64 != want {
         return bad(
             &format!("names {} files where DimSize wants {want}", names.len()),

@@ -2,6 +2,7 @@
 //! footer of scan parameters, which is ignored. Axes are RAS+ by definition.
 
 use crate::error::Problem;
+use crate::pick::{Axis, Kind, Part};
 use crate::plain::Plain;
 use crate::samples::{Endian, Layout, Number};
 use crate::source::Source;
@@ -50,16 +51,19 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
             ));
         }
     };
-    let frames = word(&h, 16);
-    if frames != 1 {
-        return Err(Problem::unsupported(
-            "nframes",
-            format!("is {frames}: there is more than one volume"),
-            "extract one of them with mri_convert --frame 0 IN OUT",
-        ));
-    }
     let sizes = [4, 8, 12].map(|at| u64::try_from(word(&h, at)).unwrap_or(0));
     let layout = Layout::new(sizes, number, Endian::Big, "width, height, depth")?;
+    let frames = u64::try_from(word(&h, 16)).unwrap_or(1);
+    let (at, said) = file.pick.choose(&[Axis::new(Kind::Time, "frames", frames)], "nframes")?;
+    said.into_iter().for_each(|note| notes.add(note));
+    let part = match frames {
+        1 => None,
+        _ => Part::new(
+            &[&sizes[..], &[frames]].concat(),
+            vec![None, None, None, Some(at[0])],
+            number.bytes(),
+        ),
+    };
     let placed = i16::from_be_bytes([h[28], h[29]]) == 1;
     let v = |at: usize| DVec3::new(float(&h, at), float(&h, at + 4), float(&h, at + 8));
     let (spacing, directions, centre) = match placed {
@@ -79,7 +83,7 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
     lattice.check().map_err(|e| {
         Problem::malformed("delta, Mdc", e, "correct them with mri_convert, or get the file again")
     })?;
-    let (samples, map, _) = file.samples(&layout)?;
+    let (samples, map, _) = file.samples(&layout, part.as_ref())?;
     Ok(Volume::new(name, number.name(), true, lattice, samples, map))
 }
 
@@ -138,6 +142,25 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn mgh_of_several_frames_gives_the_picked_one() {
+        let mut two = mgh(4, true);
+        let (mut frame, footer) = (two.split_off(HEADER_BYTES), 8);
+        frame.truncate(frame.len() - footer);
+        let second: Vec<u8> = frame.chunks(2).flat_map(|w| [w[0] + 1, w[1]]).collect();
+        two[16..20].copy_from_slice(&2i32.to_be_bytes());
+        let two = [two, frame, second, vec![0; footer]].concat();
+        let (v, notes) = open(two.clone()).unwrap();
+        assert_eq!(v.digest(), open(mgh(4, true)).unwrap().0.digest());
+        assert!(notes.contains("the first of 2 frames was read; --time takes another"), "{notes}");
+        for bytes in [two.clone(), gzip(&two)] {
+            let pick = crate::Pick { time: Some(1), ..crate::Pick::default() };
+            let hints = crate::Hints { pick, ..crate::Hints::default() };
+            let v = crate::read(Source::from_bytes(bytes), Path::new("."), "a", &hints).unwrap();
+            assert_eq!(v.summary.range(), (256.0, 279.0));
+        }
+    }
+
+    #[test]
     fn mgh_without_directions_has_those_of_freesurfer_and_says_so() {
         let (v, notes) = open(mgh(0, false)).unwrap();
         assert_eq!(v.lattice.steps, [DVec3::NEG_X, DVec3::NEG_Z, DVec3::Y]);
@@ -152,7 +175,6 @@ pub(crate) mod tests {
             open(bytes).unwrap_err().to_string()
         };
         for (at, n, say) in [
-            (16, 3, "nframes: is 3: there is more than one volume; extract one"),
             (20, 2, "type: 2 is not one of"),
             (4, 100, "data: truncated: 1200 bytes are needed and 56 are there"),
             (30, 0, "delta, Mdc: a spacing is zero"),

@@ -5,6 +5,7 @@
 //! stay as they are, and the lattice's steps are turned instead. Lengths are in angstrom.
 
 use crate::error::Problem;
+use crate::pick::{Axis, Kind, Part};
 use crate::plain::Plain;
 use crate::samples::{Endian, Layout, Number};
 use crate::source::{Notes, Source};
@@ -106,16 +107,18 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
             "get the file again",
         ));
     };
-    let sizes = header.words(1).map(|n| n.unsigned_abs().into());
+    let mut sizes: [u64; 3] = header.words(1).map(|n| n.unsigned_abs().into());
     let group = header.word(23);
     let per_volume = u64::from(header.word(10).unsigned_abs());
-    if group >= 401 && per_volume > 0 && per_volume < sizes[2] {
-        return Err(Problem::unsupported(
-            "ISPG",
-            format!("is {group}: the file holds {} volumes", sizes[2] / per_volume),
-            "save one of them, for instance with IMOD's newstack or EMAN2's e2proc3d.py",
-        ));
+    let mut volumes = 1;
+    // A stack of volumes has MZ sections in each.
+    if group >= 401 && per_volume > 0 && sizes[2].is_multiple_of(per_volume) {
+        volumes = sizes[2] / per_volume;
+        sizes[2] = per_volume;
     }
+    let axes = [Axis::new(Kind::Other, "volumes", volumes)];
+    let (at, said) = file.pick.choose(&axes, "ISPG")?;
+    said.into_iter().for_each(|note| notes.add(note));
     let mode = header.word(4);
     let number = match mode {
         0 => byte_type(&header, &notes),
@@ -138,22 +141,26 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
             ));
         }
     };
-    let layout = Layout::new(sizes, number, header.endian, "NX, NY, NZ")?;
+    let half = mode == 12;
+    let endian = if half { Endian::Little } else { header.endian };
+    let layout = Layout::new(sizes, number, endian, "NX, NY, NZ")?;
+    let part = match volumes {
+        1 => None,
+        _ => Part::new(
+            &[&sizes[..], &[volumes]].concat(),
+            vec![None, None, None, Some(at[0])],
+            if half { 2 } else { number.bytes() },
+        ),
+    };
     let lattice = lattice(&header, layout.dims, &notes)?;
     let extended = header.word(24);
     let extended = u64::try_from(extended).map_err(|_| {
         Problem::malformed("NSYMBT", format!("is {extended}"), "get the file again")
     })?;
     file.skip(extended, "NSYMBT")?;
-    let (kind, samples, map, after) = match mode {
-        12 => {
-            let (_, samples, map, after) = file.halves(sizes, header.endian, "NX, NY, NZ")?;
-            ("float16", samples, map, after)
-        }
-        _ => {
-            let (samples, map, after) = file.samples(&layout)?;
-            (number.name(), samples, map, after)
-        }
+    let (kind, (samples, map, after)) = match half {
+        true => ("float16", file.halves(&layout, header.endian, part.as_ref())?),
+        false => (number.name(), file.samples(&layout, part.as_ref())?),
     };
     if after > 0 {
         notes.add(format!("{after} bytes after the samples were not read"));
@@ -422,10 +429,22 @@ pub(crate) mod tests {
             let e = open(bytes).map(|(_, notes)| notes).unwrap_err().to_string();
             assert!(e.contains(say) || index == 14 && e.contains("CELLB"), "{e}");
         }
-        let mut several = mrc(false, 1, [1, 2, 3], true);
-        put(&mut several, 23, 401);
-        put(&mut several, 10, 1);
-        let e = open(several).unwrap_err().to_string();
-        assert!(e.contains("ISPG: is 401: the file holds 2 volumes; save one"), "{e}");
+    }
+
+    #[test]
+    fn mrc_stack_of_volumes_gives_the_picked_one() {
+        for mode in [1, 12] {
+            let mut several = mrc(false, mode, [1, 2, 3], true);
+            put(&mut several, 23, 401);
+            put(&mut several, 10, 1);
+            let (v, notes) = open(several.clone()).unwrap();
+            assert_eq!((v.lattice.dims, v.summary.range()), ([4, 3, 1], (0.0, 11.0)));
+            assert!(notes.contains("the first of 2 volumes was read; --volume takes"), "{notes}");
+            let pick = crate::Pick { volume: Some(1), ..crate::Pick::default() };
+            let hints = crate::Hints { pick, ..crate::Hints::default() };
+            let source = Source::from_bytes(several);
+            let v = crate::read(source, Path::new("."), "a.mrcs", &hints).unwrap();
+            assert_eq!(v.summary.range(), (12.0, 23.0), "mode {mode}");
+        }
     }
 }

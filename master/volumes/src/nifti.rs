@@ -7,8 +7,11 @@
 
 pub(crate) mod pair;
 
+use crate::data;
 use crate::error::{OpenErrorKind, Problem};
 use crate::members::{Members, Packing};
+use crate::numbers::Beside;
+use crate::pick::{Axis, Kind, Part, Pick};
 use crate::samples::{self, Endian, Layout, Number, SKIP_MAX_BYTES, Supply};
 use crate::source::{self, Source};
 use glam::{DMat3, DVec3};
@@ -27,7 +30,8 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// Reads a volume from the start of a source.
 pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Problem> {
-    let (len, cap) = (source.len, source.cap);
+    let (source_pick, said) = (source.pick, source.notes.clone());
+    let (len, cap, beside) = (source.len, source.cap.clone(), source.cap.beside);
     let mut reader: Box<dyn Read + Send> = match gzip {
         true => Box::new(Members::new(Packing::Gzip, source.reader, source.notes.clone())),
         false => Box::new(source.reader),
@@ -49,7 +53,8 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
     };
     fill(reader, &mut bytes[4..size])?;
     let header = Header::parse(&bytes[..size], endian)?;
-    let layout = header.layout(endian)?;
+    let (layout, part, notes) = header.layout(endian, source_pick)?;
+    notes.into_iter().for_each(|note| said.add(note));
     let (lattice, anatomical) = header.lattice(layout.dims)?;
     let skip = header.skip_bytes(size as u64)?;
     if !source::skip_bytes(reader, skip).map_err(|e| broken(&e))? {
@@ -63,8 +68,11 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
         true => Supply::deflate("gzip", len),
         false => Supply::Plain { have: len.saturating_sub(size as u64 + skip) },
     };
-    let (samples, stored) = samples::read(reader, supply, &layout, cap)?;
-    header.volume(name, anatomical, &layout, lattice, samples, stored)
+    let (samples, stored) = match &part {
+        Some(part) => data::read_part(reader, supply, part, &layout, cap)?,
+        None => samples::read(reader, supply, &layout, cap)?,
+    };
+    header.volume(name, anatomical, &layout, lattice, (samples, stored), &beside)
 }
 
 fn fill(reader: &mut dyn Read, bytes: &mut [u8]) -> Result<(), Problem> {
@@ -190,7 +198,13 @@ impl Header {
         }
     }
 
-    fn layout(&self, endian: Endian) -> Result<Layout, Problem> {
+    /// Returns the layout of the volume that is read, which part of the samples it is, if not all,
+    /// and notes.
+    fn layout(
+        &self,
+        endian: Endian,
+        pick: Pick,
+    ) -> Result<(Layout, Option<Part>, Vec<String>), Problem> {
         let number = match self.datatype {
             2 => Number::U8,
             4 => Number::I16,
@@ -202,12 +216,12 @@ impl Header {
             768 => Number::U32,
             1024 => Number::I64,
             1280 => Number::U64,
+            // Components of 8 bits beside each other.
+            128 | 2304 => Number::U8,
             code => {
                 let name = match code {
                     1 => "one bit a voxel",
                     32 | 1792 | 2048 => "complex numbers",
-                    128 => "RGB colours",
-                    2304 => "RGBA colours",
                     1536 => "128-bit floats",
                     _ => "not a type of the NIfTI format",
                 };
@@ -228,15 +242,54 @@ impl Header {
                 ));
             }
         };
-        if let Some(a) = (4..=axes).find(|&a| self.dim[a] > 1) {
-            return Err(Problem::unsupported(
-                format!("dim[{a}]"),
-                format!("is {}: there is more than one volume", self.dim[a]),
-                "extract one of them into a file of its own",
-            ));
+        let dims: [u64; 3] = std::array::from_fn(|a| self.dim[a + 1].try_into().unwrap_or(0));
+        let layout = Layout::new(dims, number, endian, "dim")?;
+        let colours = match self.datatype {
+            128 => Some(("RGB", 3)),
+            2304 => Some(("RGBA", 4)),
+            _ => None,
+        };
+        let mut more = Vec::new();
+        if let Some((name, size)) = colours {
+            let axis = Axis::new(Kind::Channel, format!("colours ({name})"), size);
+            more.push(Axis { of_voxel: true, ..axis });
         }
-        let dims = std::array::from_fn(|a| self.dim[a + 1].try_into().unwrap_or(0));
-        Layout::new(dims, number, endian, "dim")
+        for a in 4..=axes {
+            let Ok(size @ 1..) = u64::try_from(self.dim[a]) else {
+                return Err(Problem::malformed(
+                    format!("dim[{a}]"),
+                    format!("is {}", self.dim[a]),
+                    "correct it (1 if there is one volume)",
+                ));
+            };
+            more.push(match a {
+                4 => Axis::new(Kind::Time, "times", size),
+                // The standard's place for the components of vectors.
+                5 => Axis { of_voxel: true, ..Axis::new(Kind::Channel, "components", size) },
+                _ => Axis::new(Kind::Other, format!("along dim[{a}]"), size),
+            });
+        }
+        if more.iter().all(|axis| axis.size == 1) {
+            more.clear();
+        }
+        let field = match (colours, more.iter().any(|a| a.of_voxel && a.size > 1)) {
+            (Some(_), _) => "datatype",
+            (None, true) => "dim[5]",
+            _ => "dim[4]",
+        };
+        let (at, notes) = pick.choose(&more, field)?;
+        if more.is_empty() {
+            return Ok((layout, None, notes));
+        }
+        let mut sizes: Vec<u64> = more.iter().map(|axis| axis.size).collect();
+        let mut at: Vec<Option<u64>> = at.into_iter().map(Some).collect();
+        let first = usize::from(colours.is_some());
+        sizes.splice(first..first, dims);
+        at.splice(first..first, [None; 3]);
+        let part = Part::new(&sizes, at, number.bytes()).ok_or_else(|| {
+            Problem::malformed("dim", "has more samples than can be", "correct it")
+        })?;
+        Ok((layout, Some(part), notes))
     }
 
     /// Returns the bytes between the header and the first sample.
@@ -319,10 +372,13 @@ impl Header {
         anatomical: bool,
         layout: &Layout,
         lattice: Lattice,
-        samples: Samples,
-        stored: ValueMap,
+        (samples, stored): (Samples, ValueMap),
+        beside: &Beside,
     ) -> Result<Volume, Problem> {
         let map = self.value_map(stored);
+        if let Some(rescale) = self.rescale() {
+            beside.rescale(rescale);
+        }
         let volume = Volume::new(name, layout.number.name(), anatomical, lattice, samples, map);
         let (lo, hi) = volume.summary.range();
         if !(lo.is_finite() && hi.is_finite() && map.scale.is_normal()) {
@@ -335,14 +391,20 @@ impl Header {
         Ok(volume)
     }
 
-    /// Returns the map from codes to values: `stored`, then the header's slope and intercept.
-    fn value_map(&self, stored: ValueMap) -> ValueMap {
+    /// Returns slope and intercept, if the header has them.
+    fn rescale(&self) -> Option<ValueMap> {
         // "If the scl_slope field is nonzero" (nifti1.h); SPM writes NaN for none.
         if self.slope == 0.0 || !self.slope.is_finite() {
-            return stored;
+            return None;
         }
-        let inter = if self.inter.is_finite() { self.inter } else { 0.0 };
-        ValueMap { scale: self.slope * stored.scale, offset: self.slope * stored.offset + inter }
+        let offset = if self.inter.is_finite() { self.inter } else { 0.0 };
+        Some(ValueMap { scale: self.slope, offset })
+    }
+
+    /// Returns the map from codes to values: `stored`, then the header's slope and intercept.
+    fn value_map(&self, stored: ValueMap) -> ValueMap {
+        let Some(ValueMap { scale, offset }) = self.rescale() else { return stored };
+        ValueMap { scale: scale * stored.scale, offset: scale * stored.offset + offset }
     }
 }
 

@@ -9,6 +9,7 @@
 
 use crate::data::{self, HeaderLines, Skip, Storage};
 use crate::error::{Problem, quoted};
+use crate::pick::{Axis, Kind, Part, Pick};
 use crate::samples::{Endian, Layout, Number};
 use crate::source::Source;
 use crate::unpack::Encoding;
@@ -29,11 +30,13 @@ const RESAVE: &str = "save it again with `encoding: gzip` or `encoding: raw`";
 /// must lie.
 pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volume, Problem> {
     let (fields, header_bytes) = Fields::read(&mut source)?;
-    let header = Header::from_fields(&fields)?;
+    let header = Header::from_fields(&fields, source.pick)?;
+    header.notes.iter().for_each(|note| source.notes.add(note));
+    let part = header.part.as_ref();
     let samples = match &header.data_files {
         None => {
             let len = source.len.saturating_sub(header_bytes);
-            data::read(source, len, &header.storage, &header.layout)
+            data::read(source, len, &header.storage, &header.layout, part)
         }
         Some(files) => {
             let files = (&files[..], "data file");
@@ -42,7 +45,7 @@ pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volu
                 files,
                 (source.cap, &source.notes),
                 &header.storage,
-                &header.layout,
+                (&header.layout, part),
             )
         }
     };
@@ -171,6 +174,9 @@ fn canonical_field(name: &str) -> String {
 /// An interpreted header.
 struct Header {
     layout: Layout,
+    /// Which part of the samples is read, if not all.
+    part: Option<Part>,
+    notes: Vec<String>,
     lattice: Lattice,
     anatomical: bool,
     storage: Storage,
@@ -178,11 +184,11 @@ struct Header {
 }
 
 impl Header {
-    fn from_fields(fields: &Fields) -> Result<Header, Problem> {
+    fn from_fields(fields: &Fields, pick: Pick) -> Result<Header, Problem> {
         let number = number_type(fields)?;
         let encoding = encoding(fields)?;
         let endian = endian(fields, number, encoding)?;
-        let axes = Axes::from_fields(fields)?;
+        let axes = Axes::from_fields(fields, pick)?;
         let layout = Layout::new(axes.sizes, number, endian, &fields.with_line("sizes"))?;
         let (lattice, anatomical) = lattice(fields, &axes, layout.dims)?;
         let skip = |name: &str| match fields.get(name) {
@@ -202,7 +208,9 @@ impl Header {
             };
         let data_files = data_files(fields, &axes)?;
         let storage = Storage { encoding, line_skip, byte_skip, skip_field: "byte skip" };
-        Ok(Header { layout, lattice, anatomical, storage, data_files })
+        let part = axes.part(number, fields)?;
+        let notes = axes.notes;
+        Ok(Header { layout, part, notes, lattice, anatomical, storage, data_files })
     }
 }
 
@@ -342,10 +350,14 @@ struct Axes {
     sizes: [u64; 3],
     /// Sizes of all axes of the file.
     all: Vec<u64>,
+    /// Index along each axis that is not kept.
+    at: Vec<Option<u64>>,
+    /// Notes on volumes that are not read.
+    notes: Vec<String>,
 }
 
 impl Axes {
-    fn from_fields(fields: &Fields) -> Result<Axes, Problem> {
+    fn from_fields(fields: &Fields, pick: Pick) -> Result<Axes, Problem> {
         let dimension = fields.required("dimension", "3")?;
         let count = match dimension.parse::<usize>() {
             Ok(n @ 1..=AXES_MAX) => n,
@@ -359,8 +371,6 @@ impl Axes {
             sizes.iter().map(|w| w.parse()).collect::<Result<_, _>>().map_err(|_| {
                 fields.malformed("sizes", "has something else than whole numbers", "correct it")
             })?;
-        let mut kept: Vec<usize> = (0..count).collect();
-        // Drop axes of one sample, first those that the file marks as not spatial.
         let list = sizes.iter().map(u64::to_string).collect::<Vec<_>>().join(" x ");
         if count < 3 {
             let what = if count == 2 { "a picture of two axes" } else { "a row of one axis" };
@@ -415,29 +425,82 @@ impl Axes {
                 },
             )
         };
-        while kept.len() > 3 {
-            let single = |a: &usize| sizes[*a] == 1;
-            let dropped = kept
-                .iter()
-                .rposition(|a| single(a) && outside_space(*a))
-                .or_else(|| kept.iter().rposition(single));
-            let Some(index) = dropped else {
-                if let Some(&axis) = kept.iter().find(|a| outside_space(**a)) {
-                    return Err(no_space(axis));
+        // What lies along an axis that is none of space.
+        let other = |axis: usize| {
+            let size = sizes[axis];
+            let kind = kinds.get(axis).map(|k| k.to_ascii_lowercase()).unwrap_or_default();
+            let time = directions.get(axis).is_some_and(|d| d.as_ref().is_some_and(|d| d.more));
+            match kind.as_str() {
+                "time" => Axis::new(Kind::Time, "times", size),
+                _ if time => Axis::new(Kind::Time, "times", size),
+                "list" => Axis::new(Kind::Other, "volumes (a list)", size),
+                "" | "none" | "???" | "domain" | "space" if axis > 0 => {
+                    Axis::new(Kind::Other, format!("along axis {}", axis + 1), size)
                 }
+                kind => {
+                    let name = match kinds.get(axis) {
+                        Some(given) if !matches!(kind, "none" | "???" | "domain" | "space") => {
+                            format!("components ({given})")
+                        }
+                        _ => "numbers".into(),
+                    };
+                    Axis { of_voxel: true, ..Axis::new(Kind::Channel, name, size) }
+                }
+            }
+        };
+        let in_space: Vec<usize> = (0..count).filter(|&a| !outside_space(a)).collect();
+        if let (0..3, Some(axis)) = (in_space.len(), (0..count).find(|&a| outside_space(a))) {
+            return Err(no_space(axis));
+        }
+        let mut kept = in_space;
+        while kept.len() > 3 {
+            // Of four axes that may all be of space, those of one sample go, the last first.
+            let single = kept.iter().rposition(|a| sizes[*a] == 1);
+            // Nothing says which they are but the flag.
+            let asked = match pick {
+                Pick { volume: Some(_), .. } => Some(kept.len() - 1),
+                Pick { channel: Some(_), .. } => Some(0),
+                _ => None,
+            };
+            let Some(index) = single.or(asked) else {
                 return Err(Problem::unsupported(
                     fields.with_line("dimension"),
-                    format!("{list} has {} axes of more than one sample", kept.len()),
-                    "save one volume of it with three axes",
+                    format!(
+                        "{list} has {} axes of more than one sample, and nothing says which are of \
+                         space",
+                        kept.len()
+                    ),
+                    "take a volume along the last with --volume 0, a number along the first with \
+                     --channel 0, or add `kinds`",
                 ));
             };
             kept.remove(index);
         }
-        if let Some(&axis) = kept.iter().find(|a| outside_space(**a)) {
-            return Err(no_space(axis));
-        }
         let kept = <[usize; 3]>::try_from(kept).expect("three of three or more axes are left");
-        Ok(Axes { count, kept, sizes: kept.map(|a| sizes[a]), all: sizes })
+        let dropped: Vec<usize> = (0..count).filter(|a| !kept.contains(a)).collect();
+        let more: Vec<Axis> = dropped.iter().map(|&a| other(a)).collect();
+        let field =
+            dropped.first().map_or("sizes", |_| if kinds.is_empty() { "sizes" } else { "kinds" });
+        let (picked, notes) = pick.choose(&more, &fields.with_line(field))?;
+        let mut at = vec![None; count];
+        for (axis, index) in dropped.into_iter().zip(picked) {
+            at[axis] = Some(index);
+        }
+        Ok(Axes { count, kept, sizes: kept.map(|a| sizes[a]), all: sizes, at, notes })
+    }
+
+    /// Returns which part of the samples is read, if not all.
+    fn part(&self, number: Number, fields: &Fields) -> Result<Option<Part>, Problem> {
+        let several = self.at.iter().zip(&self.all).any(|(at, size)| at.is_some() && *size > 1);
+        if !several {
+            return Ok(None);
+        }
+        match Part::new(&self.all, self.at.clone(), number.bytes()) {
+            Some(part) => Ok(Some(part)),
+            None => {
+                Err(fields.malformed("sizes", "has more samples than can be", "correct the sizes"))
+            }
+        }
     }
 }
 

@@ -133,7 +133,7 @@ fn orientation_of_anatomical_formats_is_ras() {
         for name in ["v.nrrd", "v.nii", "v.nii.gz"] {
             let mut bytes = Vec::new();
             let format = crate::write::Format::from_name(name).unwrap();
-            crate::write::write(&v, format, &mut bytes, &mut |_| Ok(())).unwrap();
+            crate::write::write(&v, None, format, &mut bytes, &mut |_| Ok(())).unwrap();
             let again = open(bytes, name);
             check(&again, name);
             assert!(again.anatomical);

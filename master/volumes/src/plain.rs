@@ -1,9 +1,11 @@
 //! Files read from front to back: a header, the samples, and perhaps a footer; plain or inside gzip.
 
+use crate::data;
 use crate::error::{OpenErrorKind, Problem};
 use crate::limit::ByteCap;
 use crate::members::{Members, Packing};
-use crate::samples::{self, Endian, Layout, Number, SKIP_MAX_BYTES, Supply};
+use crate::pick::{Part, Pick};
+use crate::samples::{self, Endian, Layout, SKIP_MAX_BYTES, Supply};
 use crate::source::{self, Notes, Source};
 use slabcast_common::volume::{Samples, ValueMap};
 use std::io::{ErrorKind, Read};
@@ -14,7 +16,9 @@ pub(crate) struct Plain {
     gzip: bool,
     /// Bytes of the file.
     len: u64,
-    cap: ByteCap,
+    pub(crate) cap: ByteCap,
+    /// Which volume to read, if there are several.
+    pub(crate) pick: Pick,
     pub(crate) notes: Notes,
     /// Bytes read so far, after decompression.
     pub(crate) consumed: u64,
@@ -23,12 +27,12 @@ pub(crate) struct Plain {
 impl Plain {
     /// Reads a source from its start; `gzip` says that it is compressed.
     pub(crate) fn new(source: Source, gzip: bool) -> Plain {
-        let Source { reader, len, cap, notes, .. } = source;
+        let Source { reader, len, cap, pick, notes } = source;
         let reader: Box<dyn Read + Send> = match gzip {
             true => Box::new(Members::new(Packing::Gzip, reader, notes.clone())),
             false => Box::new(reader),
         };
-        Plain { reader, gzip, len, cap, notes, consumed: 0 }
+        Plain { reader, gzip, len, cap, pick, notes, consumed: 0 }
     }
 
     /// Reads the next bytes of the header.
@@ -54,38 +58,52 @@ impl Plain {
         }
     }
 
-    /// Reads the samples; what follows them is a footer and ignored. Returns the number of bytes
-    /// that follow, where the file is not compressed.
-    pub(crate) fn samples(self, layout: &Layout) -> Result<(Samples, ValueMap, u64), Problem> {
+    /// Reads the samples, or a part of them; what follows them is a footer and ignored. Returns the
+    /// number of bytes that follow, where the file is not compressed.
+    pub(crate) fn samples(
+        self,
+        layout: &Layout,
+        part: Option<&Part>,
+    ) -> Result<(Samples, ValueMap, u64), Problem> {
         let left = self.len.saturating_sub(self.consumed);
         let supply = match self.gzip {
             true => Supply::deflate("gzip", self.len),
             false => Supply::Plain { have: left },
         };
+        if let Some(part) = part {
+            let (samples, map) = data::read_part(self.reader, supply, part, layout, self.cap)?;
+            let whole = if self.gzip { left } else { part.whole_bytes() };
+            return Ok((samples, map, left.saturating_sub(whole)));
+        }
         let mut body = Body { reader: self.reader, left: layout.bytes(), gzip: self.gzip };
         let (samples, map) = samples::read(&mut body, supply, layout, self.cap)?;
         Ok((samples, map, if self.gzip { 0 } else { left - layout.bytes() }))
     }
 
-    /// Reads samples that are 16-bit floats, as 32-bit ones; otherwise like [`Plain::samples`].
+    /// Reads samples that are 16-bit floats, as the 32-bit ones of a little-endian layout; `part` has
+    /// two bytes a number. Otherwise like [`Plain::samples`].
     pub(crate) fn halves(
         self,
-        dims: [u64; 3],
+        layout: &Layout,
         endian: Endian,
-        field: &str,
-    ) -> Result<(Layout, Samples, ValueMap, u64), Problem> {
-        let layout = Layout::new(dims, Number::F32, Endian::Little, field)?;
+        part: Option<&Part>,
+    ) -> Result<(Samples, ValueMap, u64), Problem> {
         let left = self.len.saturating_sub(self.consumed);
-        let need = layout.bytes() / 2;
+        let need = part.map_or(layout.bytes() / 2, Part::end);
         let supply = match self.gzip {
             true => Supply::deflate("gzip", 2 * self.len),
             false if left < need => return Err(samples::truncated(need, left)),
             false => Supply::Plain { have: 2 * left },
         };
-        let body = Body { reader: self.reader, left: need, gzip: self.gzip };
-        let mut floats = Halves { inner: body, endian };
-        let (samples, map) = samples::read(&mut floats, supply, &layout, self.cap)?;
-        Ok((layout, samples, map, if self.gzip { 0 } else { left - need }))
+        let whole = part.map_or(need, Part::whole_bytes);
+        let after = if self.gzip { 0 } else { left.saturating_sub(whole) };
+        let inner: Box<dyn Read + Send> = match part {
+            Some(part) => Box::new(part.reader(self.reader)),
+            None => Box::new(Body { reader: self.reader, left: need, gzip: self.gzip }),
+        };
+        let (samples, map) =
+            samples::read(&mut Halves { inner, endian }, supply, layout, self.cap)?;
+        Ok((samples, map, after))
     }
 }
 

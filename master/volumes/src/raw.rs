@@ -56,30 +56,41 @@ impl RawHints {
         *self == RawHints::default()
     }
 
-    /// Fills in from a file's name what the flags leave open.
+    /// Fills in from a file's name what the flags leave open. A type with digits (`uint16`) goes
+    /// before one that is an ordinary word (`short`), and the later word before the earlier. A byte
+    /// order alone counts only after the size or a type with digits: files are called `big_one`.
     fn or_from_name(mut self, name: &str) -> RawHints {
         let stem = name.to_ascii_lowercase();
+        let (mut dims, mut digits, mut word_type, mut order) = (None, None, None, None);
         // Sizes and types are runs of letters and digits; everything else separates words.
         for word in stem.split(|c: char| !c.is_ascii_alphanumeric()) {
             let sizes: Vec<&str> = word.split('x').collect();
             if let [a, b, c] = sizes[..]
                 && let (Ok(a), Ok(b), Ok(c)) = (a.parse(), b.parse(), c.parse())
             {
-                self.dims = self.dims.or(Some([a, b, c]));
+                dims = dims.or(Some([a, b, c]));
                 continue;
             }
+            let placed = dims.is_some() || digits.is_some();
             match word {
-                "le" | "little" => self.big_endian = self.big_endian.or(Some(false)),
-                "be" | "big" => self.big_endian = self.big_endian.or(Some(true)),
+                "le" | "little" if placed => order = order.or(Some(false)),
+                "be" | "big" if placed => order = order.or(Some(true)),
                 _ => {}
             }
             for (suffix, big) in [("", None), ("le", Some(false)), ("be", Some(true))] {
-                if let Some(n) = word.strip_suffix(suffix).and_then(number_type) {
-                    self.number = self.number.or(Some(n));
-                    self.big_endian = self.big_endian.or(big);
+                let Some(n) = word.strip_suffix(suffix).and_then(number_type) else { continue };
+                if word.contains(|c: char| c.is_ascii_digit()) {
+                    digits = digits.or(Some(n));
+                    order = big.or(order);
+                } else {
+                    word_type = Some(n);
+                    order = order.or(big);
                 }
             }
         }
+        self.dims = self.dims.or(dims);
+        self.number = self.number.or(digits).or(word_type);
+        self.big_endian = self.big_endian.or(order);
         self
     }
 }
@@ -140,13 +151,26 @@ pub(crate) fn read(
     }
     let lattice = Lattice::from_spacing(layout.dims, known.spacing.unwrap_or([1.0; 3]));
     lattice.check().map_err(|e| Problem::malformed("--spacing", e, "give three lengths"))?;
+    // What the name said is a guess.
+    if hints.dims.is_none() || hints.number.is_none() {
+        let order = match (number.bytes(), endian) {
+            (1, _) => "",
+            (_, Endian::Little) => ", little-endian",
+            (_, Endian::Big) => ", big-endian",
+        };
+        source.notes.add(format!(
+            "raw numbers: {} of {}{order} were taken, by the file's name",
+            format_dims(dims),
+            number.name()
+        ));
+    }
     let storage = Storage {
         encoding: if gzip { Encoding::Gzip } else { Encoding::Raw },
         line_skip: 0,
         byte_skip: Skip::Bytes(skip),
         skip_field: "--skip",
     };
-    let (samples, map) = data::read(source, len, &storage, &layout)?;
+    let (samples, map) = data::read(source, len, &storage, &layout, None)?;
     Ok(Volume::new(name, number.name(), false, lattice, samples, map))
 }
 

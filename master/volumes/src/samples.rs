@@ -12,7 +12,8 @@
 //! | other float64 | f32 in 0..1 | min + c (max - min) |
 //!
 //! A 32-bit integer with a wide range loses its low bits (f32 has 24), as in every renderer that
-//! samples floats. The shift by the minimum keeps the span.
+//! samples floats. One value far beyond all others (-3e38) stands for none and becomes NaN. The shift by the minimum keeps the span. A note says so, or the numbers are kept
+//! beside the codes ([`crate::numbers`]).
 
 use crate::error::{OpenErrorKind, Problem};
 use crate::limit::ByteCap;
@@ -90,6 +91,12 @@ impl Number {
             Number::I64 => (i64::MIN as f64, i64::MAX as f64),
             Number::F32 | Number::F64 => return None,
         })
+    }
+
+    /// Returns the type of this name.
+    pub(crate) fn named(name: &str) -> Option<Number> {
+        let floats = [Number::F32, Number::F64];
+        Number::INTEGERS.into_iter().chain(floats).find(|n| n.name() == name)
     }
 
     /// Returns the type's name, such as `uint8`.
@@ -265,12 +272,12 @@ pub(crate) fn read(
             })?;
             (Samples::U16(v), shifted(-32768.0))
         }
-        Number::F32 => (Samples::F32(data.collect(words!(f32))?), ValueMap::IDENTITY),
-        Number::U32 => wide::compact_integers(data.collect_pieces(words!(u32))?, i128::from)?,
-        Number::I32 => wide::compact_integers(data.collect_pieces(words!(i32))?, i128::from)?,
-        Number::U64 => wide::compact_integers(data.collect_pieces(words!(u64))?, i128::from)?,
-        Number::I64 => wide::compact_integers(data.collect_pieces(words!(i64))?, i128::from)?,
-        Number::F64 => wide::compact_doubles(data.collect_pieces(words!(f64))?)?,
+        Number::F32 => wide::without_fillers(data.collect(words!(f32))?, &cap.beside)?,
+        Number::U32 => wide::compact_integers(data.collect_pieces(words!(u32))?, &cap.beside)?,
+        Number::I32 => wide::compact_integers(data.collect_pieces(words!(i32))?, &cap.beside)?,
+        Number::U64 => wide::compact_integers(data.collect_pieces(words!(u64))?, &cap.beside)?,
+        Number::I64 => wide::compact_integers(data.collect_pieces(words!(i64))?, &cap.beside)?,
+        Number::F64 => wide::compact_doubles(data.collect_pieces(words!(f64))?, &cap.beside)?,
     })
 }
 

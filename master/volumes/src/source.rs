@@ -6,6 +6,7 @@
 
 use crate::error::{OpenErrorKind, Problem};
 use crate::limit::ByteCap;
+use crate::pick::Pick;
 use std::fs::File;
 use std::io::{BufRead, BufReader, ErrorKind, Read, Seek};
 use std::path::{Path, PathBuf};
@@ -22,6 +23,8 @@ pub(crate) struct Source {
     pub(crate) len: u64,
     /// Most bytes of samples that it may become.
     pub(crate) cap: ByteCap,
+    /// Which volume to read, if there are several.
+    pub(crate) pick: Pick,
     /// Choices that the reader makes, for the user.
     pub(crate) notes: Notes,
 }
@@ -47,7 +50,7 @@ impl Notes {
 
 /// Enough to recognise a format ([`Source::head`]) with few system calls. Samples are read past the
 /// buffer in larger pieces.
-const BUFFER_BYTES: usize = 64 << 10;
+pub(crate) const BUFFER_BYTES: usize = 64 << 10;
 
 impl Source {
     /// Opens a regular file; refuses a folder, pipe, socket or device without reading it.
@@ -95,7 +98,13 @@ impl Source {
     /// Returns a source of an open regular file of `len` bytes.
     fn from_file(file: File, len: u64) -> Source {
         let reader = BufReader::with_capacity(BUFFER_BYTES, Box::new(file) as Box<dyn Stream>);
-        Source { reader, len, cap: ByteCap::default(), notes: Notes::default() }
+        Source {
+            reader,
+            len,
+            cap: ByteCap::default(),
+            pick: Pick::default(),
+            notes: Notes::default(),
+        }
     }
 
     /// Returns a source of bytes, for tests.
@@ -106,6 +115,7 @@ impl Source {
             reader: BufReader::with_capacity(BUFFER_BYTES, Box::new(std::io::Cursor::new(bytes))),
             len,
             cap: ByteCap::default(),
+            pick: Pick::default(),
             notes: Notes::default(),
         }
     }

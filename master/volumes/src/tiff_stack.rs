@@ -13,6 +13,7 @@ mod description;
 use crate::Opened;
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::limit::ByteCap;
+use crate::pick::Pick;
 use crate::raw::RawHints;
 use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
 use crate::source::Source;
@@ -44,11 +45,11 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// Reads the pages of one file as slices.
 pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Opened, Problem> {
-    let (len, cap) = (source.len, source.cap);
+    let (len, cap, pick) = (source.len, source.cap.clone(), source.pick);
     let mut pages = TiffFile::open(source)?;
     let first = pages.page()?;
     let mut description = pages.description(&first)?;
-    let said = description.slices();
+    let said = description.slices(&pick)?;
     // Pictures after the first of an OME or tifffile file are volumes of their own.
     let several = match description.writer {
         Writer::Ome => description.pictures > 1,
@@ -75,11 +76,11 @@ pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Opene
     pages.rewind()?;
     let mut planes_start = None;
     let slices = match said {
-        None => Slices { count, stride: 1, total: count },
+        None => Slices { first: 0, count, stride: 1, total: count },
         Some(said) if said.total == count => said,
         // A program may have changed the pages and kept the text.
         Some(said) if said.total < count && said.total == said.count => {
-            Slices { count, stride: 1, total: count }
+            Slices { first: 0, count, stride: 1, total: count }
         }
         Some(said) => {
             planes_start = match description.writer {
@@ -112,6 +113,10 @@ pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Opene
             finish(planes, supply, (first, slices.count, endian), cap, name, spacing)?
         }
         None => {
+            for _ in 0..slices.first {
+                // They were counted.
+                pages.next()?;
+            }
             let stack = Stack {
                 current: Some(pages),
                 files: VecDeque::new(),
@@ -176,7 +181,7 @@ pub(crate) fn read_files(
         match &first {
             None => {
                 let mut description = file.description(&page).map_err(name_file)?;
-                if let Some(said) = description.slices()
+                if let Some(said) = description.slices(&Pick::default()).map_err(name_file)?
                     && (said.total > count || said.total != said.count)
                 {
                     return Err(name_file(too_few(said, count)));
@@ -678,7 +683,8 @@ impl Read for Planes {
             if self.plane == self.slices.count {
                 return Ok(0);
             }
-            let at = self.start + self.plane * self.slices.stride * self.bytes;
+            let plane = self.slices.first + self.plane * self.slices.stride;
+            let at = self.start + plane * self.bytes;
             file.seek(SeekFrom::Start(at))?;
             self.plane += 1;
             self.left = self.bytes;

@@ -32,6 +32,7 @@ pub(crate) fn read(
     name: &str,
     dataset: Option<&str>,
 ) -> Result<Volume, Problem> {
+    source.pick.choose(&[], "content")?;
     let Source { reader, len, cap, notes, .. } = source;
     let inner: Box<dyn BufRead + Send> = match gzip {
         true => {

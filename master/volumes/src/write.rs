@@ -1,8 +1,10 @@
 //! Writes volumes as NRRD and NIfTI-1.
 //!
-//! Samples are written in a type that holds their values exactly, the lattice in RAS+. NIfTI has a
-//! slope and an intercept; NRRD has none, so values that are no whole numbers become floats there.
+//! Samples are written in a type that holds their values exactly, the lattice in RAS+: the file's own
+//! numbers where the volume's codes round them ([`FileNumbers`]). NIfTI has a slope and an intercept;
+//! NRRD has none, so values that are no whole numbers become floats there.
 
+use crate::numbers::FileNumbers;
 use crate::samples::Number;
 use flate2::Compression;
 use flate2::write::GzEncoder;
@@ -53,7 +55,7 @@ impl Format {
 /// Samples between two calls of `on_progress`: some ms.
 const STEP_SAMPLES: usize = 1 << 16;
 
-/// Writes a volume to `out`.
+/// Writes a volume to `out`, with the file's own `numbers` in place of the samples if there are any.
 ///
 /// `on_progress` is called after each part with the number of samples written so far.
 ///
@@ -61,11 +63,12 @@ const STEP_SAMPLES: usize = 1 << 16;
 /// Writing to `out` fails, or `on_progress` returns an error, which ends the writing.
 pub fn write(
     volume: &Volume,
+    numbers: Option<&FileNumbers>,
     format: Format,
     out: &mut dyn Write,
     on_progress: &mut dyn FnMut(u64) -> io::Result<()>,
 ) -> io::Result<()> {
-    let form = NumberForm::choose(volume, format);
+    let form = NumberForm::choose(volume, numbers, format);
     let gzip = match format {
         Format::Nrrd { gzip } => {
             out.write_all(nrrd_header(volume, form.number, gzip).as_bytes())?;
@@ -79,12 +82,12 @@ pub fn write(
     };
     if !gzip {
         out.write_all(&header)?;
-        return write_samples(volume, &form, out, on_progress);
+        return write_samples(volume, numbers, &form, out, on_progress);
     }
     // Compression::fast is 4 times as quick as the default on mri256, for 6 % more bytes.
     let mut packed = GzEncoder::new(out, Compression::fast());
     packed.write_all(&header)?;
-    write_samples(volume, &form, &mut packed, on_progress)?;
+    write_samples(volume, numbers, &form, &mut packed, on_progress)?;
     packed.finish()?;
     Ok(())
 }
@@ -103,9 +106,36 @@ pub fn loss_warning(volume: &Volume, format: Format) -> Option<String> {
     })
 }
 
+/// Returns a note, one sentence, if samples are written in another type than the file's; `None` if
+/// they keep it.
+pub fn type_note(volume: &Volume, numbers: Option<&FileNumbers>, format: Format) -> Option<String> {
+    let form = NumberForm::choose(volume, numbers, format);
+    let (from, to) = (&volume.file_type, form.number.name());
+    if from == to || Number::named(from).is_none() {
+        return None;
+    }
+    let why = match (form.number, format) {
+        (Number::F64, Format::Nrrd { .. }) => "with slope and intercept applied, as NRRD has none",
+        (Number::F64, Format::Nifti { .. }) => {
+            "with slope and intercept applied, since NIfTI holds them in 32 bits only"
+        }
+        _ => "which holds all its values",
+    };
+    Some(format!("the file has {from}, and {to} is written, {why}"))
+}
+
+/// How the file's own numbers are written.
+#[derive(Clone, Copy, PartialEq)]
+enum Own {
+    Numbers,
+    Values,
+}
+
 /// How samples are written: their type, and the maps from code to number and number to value.
 struct NumberForm {
     number: Number,
+    /// Whether the file's own numbers are written: as they are, or as values.
+    own: Option<Own>,
     /// Map from a code to the written number, before rounding to the type.
     number_from_code: ValueMap,
     /// Map from the written number to the value; the identity in NRRD.
@@ -114,10 +144,25 @@ struct NumberForm {
 
 impl NumberForm {
     /// Chooses the smallest form that keeps all values.
-    fn choose(volume: &Volume, format: Format) -> NumberForm {
+    fn choose(volume: &Volume, numbers: Option<&FileNumbers>, format: Format) -> NumberForm {
         let s = &volume.summary;
+        // NIfTI keeps slope and intercept in f32.
+        let exact = |x: f64| f64::from(x as f32) == x && x.is_finite();
+        let nifti = matches!(format, Format::Nifti { .. });
+        if let Some(numbers) = numbers.filter(|n| n.belong_to(s.map)) {
+            let map = numbers.rescale;
+            let as_they_are = map == ValueMap::IDENTITY
+                || nifti && exact(map.scale) && exact(map.offset) && map.scale != 0.0;
+            return NumberForm {
+                number: if as_they_are { numbers.number() } else { Number::F64 },
+                own: Some(if as_they_are { Own::Numbers } else { Own::Values }),
+                number_from_code: ValueMap::IDENTITY,
+                value_from_number: if as_they_are { map } else { ValueMap::IDENTITY },
+            };
+        }
         let as_value = |number| NumberForm {
             number,
+            own: None,
             number_from_code: s.map,
             value_from_number: ValueMap::IDENTITY,
         };
@@ -132,19 +177,21 @@ impl NumberForm {
                 return as_value(*number);
             }
         }
-        // NIfTI keeps slope and intercept in f32.
-        let exact = |x: f64| f64::from(x as f32) == x && x.is_finite();
-        let nifti = matches!(format, Format::Nifti { .. });
         if nifti && integers && exact(s.map.scale) && exact(s.map.offset) && s.map.scale != 0.0 {
             let number = if let Samples::U8(_) = volume.samples { Number::U8 } else { Number::U16 };
             return NumberForm {
                 number,
+                own: None,
                 number_from_code: ValueMap::IDENTITY,
                 value_from_number: s.map,
             };
         }
         match volume.samples {
-            Samples::F32(_) if s.map == ValueMap::IDENTITY => as_value(Number::F32),
+            Samples::F32(_)
+                if s.map == ValueMap::IDENTITY && volume.file_type != Number::F64.name() =>
+            {
+                as_value(Number::F32)
+            }
             _ => as_value(Number::F64),
         }
     }
@@ -169,10 +216,20 @@ impl NumberForm {
 
 fn write_samples(
     volume: &Volume,
+    numbers: Option<&FileNumbers>,
     form: &NumberForm,
     out: &mut dyn Write,
     on_progress: &mut dyn FnMut(u64) -> io::Result<()>,
 ) -> io::Result<()> {
+    if let (Some(numbers), Some(own)) = (numbers, form.own) {
+        let as_values = own == Own::Values;
+        let (size, mut written) = (form.number.bytes(), 0);
+        return numbers.for_each(STEP_SAMPLES, as_values, |bytes| {
+            out.write_all(bytes)?;
+            written += bytes.len() as u64 / size;
+            on_progress(written)
+        });
+    }
     let n = volume.samples.len();
     let mut bytes = Vec::with_capacity(STEP_SAMPLES * form.number.bytes() as usize);
     for first in (0..n).step_by(STEP_SAMPLES) {

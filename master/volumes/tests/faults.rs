@@ -1,7 +1,9 @@
 //! Files made after public reports of faults, in shared/faults; where they are missing, the test
 //! prints `skipped: needs shared/faults` and passes.
 
-use slabcast_volumes::{Hints, OpenError, Opened, open_with};
+use slabcast_volumes::write::{self, Format};
+use slabcast_volumes::{Hints, OpenError, Opened, open_numbers, open_with};
+use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::Path;
 
@@ -80,6 +82,67 @@ fn faults_of_zarr_have_their_axes_steps_and_values() {
             let npy = std::fs::read(folder.join("bitshuffle.expected.npy")).expect("the values");
             let want: Vec<f64> = npy[npy.len() - 315..].iter().map(|b| f64::from(*b)).collect();
             assert_eq!(first_values(&opened, 315), want);
+        }
+    }
+}
+
+#[test]
+fn labels_and_doubles_are_converted_to_the_bit() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/faults");
+    for (file, size) in [
+        ("02-convert-changes-labels/allen_like_u32.nrrd", 4),
+        ("02-convert-changes-labels/labels_i32_70001.nrrd", 4),
+        ("02-convert-changes-labels/ids_i64.nrrd", 8),
+        ("files/wide_i4.nrrd", 4),
+        ("files/wide_f8.nrrd", 8),
+    ] {
+        let Some(drawn) = fault(file) else { return };
+        assert!(drawn.notes.join("\n").contains("drawn rounded"), "{file}: {:?}", drawn.notes);
+        let (opened, numbers) = open_numbers(&folder.join(file), &Hints::default()).unwrap();
+        let write = |format| {
+            let mut bytes = Vec::new();
+            let (volume, numbers) = (&opened.volume, numbers.as_ref());
+            write::write(volume, numbers, format, &mut bytes, &mut |_| Ok(())).unwrap();
+            bytes.split_off(bytes.len() - size * volume.samples.len())
+        };
+        let nrrd = write(Format::Nrrd { gzip: false });
+        assert_eq!(nrrd, write(Format::Nifti { gzip: false }), "{file}");
+        let first =
+            |n: usize| nrrd[..n * size].chunks(size).map(<[u8]>::to_vec).collect::<Vec<_>>();
+        if file.contains("allen") {
+            let ids: BTreeSet<u32> = first(opened.volume.samples.len())
+                .iter()
+                .map(|b| u32::from_le_bytes(b[..].try_into().unwrap()))
+                .collect();
+            let want = [0, 1, 7, 997, 312_782_574, 312_782_575, 312_782_576, 614_454_277];
+            assert_eq!(ids.into_iter().collect::<Vec<_>>(), want);
+        }
+        if file.contains("wide_i4") {
+            let want = [-2_147_483_648, -2_106_185_886, -2_064_888_124, -2_023_590_361i32];
+            assert_eq!(first(4), want.map(|n| n.to_le_bytes().to_vec()));
+        }
+        if file.contains("wide_f8") {
+            let want = [-1e6, -701_922.953466288, -403_845.906_932_575_86f64];
+            assert_eq!(first(3), want.map(|n| n.to_le_bytes().to_vec()));
+        }
+    }
+}
+
+#[test]
+fn blanked_points_of_vti_have_no_value_and_masks_are_never_the_volume() {
+    for (file, blanked) in [
+        ("resampled_ball.vti", true),
+        ("vtkGhostType_first.vti", true),
+        ("vtkValidPointMask_first.vti", false),
+    ] {
+        let Some(opened) = fault(&format!("09-vti-blanked-and-ghost/{file}")) else { return };
+        let summary = &opened.volume.summary;
+        let notes = opened.notes.join("\n");
+        assert_eq!(summary.nan > 0, blanked, "{file}: {notes}");
+        assert_eq!(notes.contains("are blanked by `vtk"), blanked, "{file}: {notes}");
+        if file.contains("first") {
+            let (lo, hi) = summary.range();
+            assert!(lo < 2.0 && hi > 60.0, "{file}: {lo} to {hi}");
         }
     }
 }

@@ -150,6 +150,8 @@ fn layered_args<'a>(root: &'a Command, name: &str) -> Vec<&'a Arg> {
         }
     }
     all.retain(|a| a.get_long().is_some_and(|l| !["help", "version", "config"].contains(&l)));
+    // Which volume of one file is no setting for all, and SLABCAST_VOLUME is a master's file.
+    all.retain(|a| a.get_id() != "nth_volume");
     all
 }
 

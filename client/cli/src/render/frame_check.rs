@@ -1,7 +1,7 @@
 //! Looks at each frame for what a person should hear of: blank pictures, failures, rehearsals.
 
 use slabcast_common::stats::FrameStats;
-use slabcast_common::volume::VolumeInfo;
+use slabcast_common::volume::{ValueSummary, VolumeInfo};
 use slabcast_session::fail::Fail;
 use slabcast_session::output::Frame;
 use slabcast_session::progress;
@@ -32,11 +32,16 @@ impl FrameCheck {
             || frame.bytes[pixel..] == frame.bytes[..frame.bytes.len() - pixel];
         let (lo, hi) = info.summary.range();
         let tf = request.transfer.name();
-        let why = if stats.voxels.relevant == 0 && lo == hi {
-            format!("every value of the volume is {lo}, and `--tf {tf}` leaves that invisible")
+        let summary = &info.summary;
+        let why = if summary.nan + summary.infinite == summary.total() {
+            no_value(summary)
+        } else if stats.voxels.relevant == 0 && lo == hi {
+            let value = number(lo);
+            format!("every value of the volume is {value}, and `--tf {tf}` leaves that invisible")
         } else if stats.voxels.relevant == 0 && request.path.crop.is_some() {
             format!("no voxel in the cropping box is visible under `--tf {tf}`; widen --crop")
         } else if stats.voxels.relevant == 0 {
+            let (lo, hi) = (number(lo), number(hi));
             format!(
                 "no voxel is visible under `--tf {tf}` (values go from {lo} to {hi}); try another \
                  --tf, `slabcast info` shows what each would draw"
@@ -95,5 +100,46 @@ impl FrameCheck {
             "{which} failed, and the others are kept; see the workers' logs, then draw what is missing \
              with `--frames {first}..{last} --force`"
         )))
+    }
+}
+
+/// Returns a number for people: not 300 digits of one.
+fn number(x: f64) -> String {
+    match x.abs() {
+        0.0 | 1e-4..1e9 => format!("{x}"),
+        _ => format!("{x:.4e}"),
+    }
+}
+
+/// Says that a volume has no finite value.
+fn no_value(s: &ValueSummary) -> String {
+    let what = match (s.nan, s.infinite) {
+        (_, 0) => "all voxels are NaN (no value)".to_string(),
+        (0, _) => "all voxels are infinite".to_string(),
+        (nan, infinite) => format!("{nan} voxels are NaN (no value) and {infinite} infinite"),
+    };
+    format!("{what}, so there is nothing to draw; look at how the file was made")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use slabcast_common::volume::{Samples, ValueMap};
+
+    #[test]
+    fn volume_without_a_finite_value_is_said_to_have_none() {
+        let say = |v: Vec<f32>| {
+            no_value(&ValueSummary::from_samples(&Samples::F32(v), ValueMap::IDENTITY))
+        };
+        assert!(say(vec![f32::NAN; 3]).starts_with("all voxels are NaN (no value), so"));
+        assert!(say(vec![f32::INFINITY; 3]).starts_with("all voxels are infinite, so"));
+        let both = say(vec![f32::NAN, f32::NEG_INFINITY, f32::NAN]);
+        assert!(both.starts_with("2 voxels are NaN (no value) and 1 infinite, so"), "{both}");
+    }
+
+    #[test]
+    fn numbers_have_few_digits() {
+        let texts = [0.0, -3.5, 200.0, 1e300, -2.5e-8].map(number);
+        assert_eq!(texts, ["0", "-3.5", "200", "1.0000e300", "-2.5000e-8"]);
     }
 }

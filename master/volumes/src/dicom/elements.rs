@@ -17,8 +17,9 @@ use std::io::{BufRead, Read};
 pub(super) type Tag = (u16, u16);
 
 /// Elements whose values are kept, with their names.
-pub(super) const KEPT: [(Tag, &str); 26] = [
+pub(super) const KEPT: [(Tag, &str); 28] = [
     ((0x0002, 0x0010), "TransferSyntaxUID"),
+    ((0x0008, 0x0008), "ImageType"),
     ((0x0008, 0x0060), "Modality"),
     ((0x0008, 0x103e), "SeriesDescription"),
     ((0x0018, 0x0050), "SliceThickness"),
@@ -41,6 +42,7 @@ pub(super) const KEPT: [(Tag, &str); 26] = [
     ((0x0028, 0x0103), "PixelRepresentation"),
     ((0x0028, 0x1052), "RescaleIntercept"),
     ((0x0028, 0x1053), "RescaleSlope"),
+    ((0x0028, 0x3000), "ModalityLUTSequence"),
     ((0x3004, 0x000c), "GridFrameOffsetVector"),
     ((0x3004, 0x000e), "DoseGridScaling"),
     ((0x7fe0, 0x0010), "PixelData"),
@@ -380,6 +382,10 @@ impl ElementReader {
             self.groups(s, bytes, tag)?;
             return Ok(None);
         }
+        if tag == (0x0028, 0x3000) && bytes > 0 {
+            // That it is there is enough.
+            values.insert(tag, b"1".to_vec());
+        }
         if bytes == UNDEFINED {
             self.skip_undefined(s, 1)?;
             return Ok(None);
@@ -387,8 +393,9 @@ impl ElementReader {
         if u64::from(bytes) > len.saturating_sub(self.consumed_bytes) {
             return Err(broken(&std::io::ErrorKind::UnexpectedEof.into()));
         }
+        let sequence = tag == (0x0028, 0x3000);
         let most = if tag == (0x3004, 0x000c) { OFFSETS_MAX_BYTES } else { VALUE_MAX_BYTES };
-        if KEPT.iter().any(|(kept, _)| *kept == tag) && bytes <= most {
+        if KEPT.iter().any(|(kept, _)| *kept == tag) && bytes <= most && !sequence {
             let value = self.value(bytes)?;
             values.insert(tag, value);
         } else {

@@ -26,6 +26,7 @@ pub(crate) use series::one_slice;
 
 use crate::error::{OpenErrorKind, Problem};
 use crate::limit::ByteCap;
+use crate::pick::Pick;
 use crate::samples::{self, Endian, Layout, Supply};
 use crate::{Hints, Opened};
 use confine::{CPU_SECS, MEMORY_BYTES};
@@ -64,7 +65,7 @@ pub(crate) fn open(
                 // The receiver reports a panic, since the pipe then ends before the series.
                 let _ = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
                     // A receiver that is gone has failed on its own.
-                    let choice = SeriesChoice { series, file };
+                    let choice = SeriesChoice { series, file, pick: hints.pick };
                     let _ = write_series(files, &choice, Vec::new(), &mut sender);
                 }));
             });
@@ -79,6 +80,12 @@ pub(crate) fn open(
     }
     if let Some(file) = file {
         command.arg("--file").arg(file);
+    }
+    let Pick { volume, time, channel } = hints.pick;
+    for (flag, index) in [("--volume", volume), ("--time", time), ("--channel", channel)] {
+        if let Some(index) = index {
+            command.arg(flag).arg(index.to_string());
+        }
     }
     command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let (mut child, stdout, stderr) = Watched::start(&mut command, wall_limit(stored))
@@ -146,10 +153,12 @@ fn read_volume(
     let layout = Layout::new(lattice.dims.map(u64::from), number, Endian::Little, "slices")?;
     lattice.check().map_err(|e| Problem::malformed("slices", e, "get the series again"))?;
     let supply = Supply::Encoded { name: "DICOM", bytes, ratio: PACKED_RATIO };
+    let beside = cap.beside.clone();
     let (samples, stored) = samples::read(pipe, supply, &layout, cap).map_err(|mut p| {
         p.field = "slices".into();
         p
     })?;
+    beside.rescale(ValueMap { scale: slope, offset: intercept });
     let map = ValueMap { scale: slope * stored.scale, offset: slope * stored.offset + intercept };
     let volume = Volume::new(name, number.name(), anatomical, lattice, samples, map);
     let (lo, hi) = volume.summary.range();
@@ -200,7 +209,7 @@ impl Write for WriteTracker<'_> {
 /// and writes one series, or the problem that prevents it, to `out`.
 ///
 /// `series` names the series (its number, description, name or UID); `file` is a slice whose series
-/// is meant. First the process confines itself for good, where the system allows it: 512 MiB of
+/// is meant, and `pick` one of its times. First the process confines itself for good, where the system allows it: 512 MiB of
 /// memory, 120 s of processor time, the files of the folder to read, nothing to write but `out`, no
 /// network and no other process. What the system did not allow goes with the series as a note.
 ///
@@ -211,11 +220,12 @@ pub fn serve(
     folder: &Path,
     series: Option<&str>,
     file: Option<&Path>,
+    pick: Pick,
     out: &mut dyn Write,
 ) -> std::io::Result<()> {
     let notes = confine::confine(folder);
     match crate::folder::dicom_files(folder) {
-        Ok(files) => write_series(&files, &SeriesChoice { series, file }, notes, out),
+        Ok(files) => write_series(&files, &SeriesChoice { series, file, pick }, notes, out),
         Err(problem) => wire::write_problem(&problem, out),
     }
 }

@@ -5,6 +5,7 @@ use super::elements::{File, Packing, Pixels, Tag};
 use super::wire::Preface;
 use super::{fragments, frames, jpeg, jpeg_ls, rle};
 use crate::error::{OpenErrorKind, Problem, quoted};
+use crate::pick::{Axis, Kind, Pick};
 use crate::samples::{DIM_MAX, Endian, Layout, Number};
 use crate::source::Source;
 use glam::DVec3;
@@ -31,6 +32,8 @@ struct Slice {
     native_bytes: Option<u64>,
     /// Where the pixels are in a file of several frames.
     frame: Option<frames::Frame>,
+    /// Whether the stored numbers are indices of a palette.
+    palette: bool,
 }
 
 /// Size and number format of a picture. All slices of a series have one size; each may have a
@@ -102,6 +105,8 @@ pub(crate) struct SeriesChoice<'a> {
     pub(crate) series: Option<&'a str>,
     /// A slice of it.
     pub(crate) file: Option<&'a Path>,
+    /// Which of its times or echoes.
+    pub(crate) pick: Pick,
 }
 
 /// Writes the chosen series of these files: a preface with these notes and more, then samples in
@@ -114,7 +119,9 @@ pub(super) fn write(
 ) -> Result<(), Problem> {
     let (all, left_out, unread) = gather(files)?;
     let total = all.len();
-    if let (0, Some(problem)) = (total, unread.first()) {
+    // The file that was given, or no picture but such.
+    let given = unread.iter().find(|(path, _)| choice.file == Some(&**path));
+    if let Some((_, problem)) = given.or(unread.first().filter(|_| total == 0)) {
         return Err(problem.clone());
     }
     let mut series = choose(all, choice)?;
@@ -125,10 +132,11 @@ pub(super) fn write(
     if left_out > 0 {
         notes.push(format!("{left_out} DICOM files without a picture were left out"));
     }
-    if let Some(first) = unread.first() {
-        notes.push(format!("{} DICOM files were left out: {first}", unread.len()));
+    if let Some((_, first)) = unread.first() {
+        let (n, were) = (unread.len(), if unread.len() == 1 { " was" } else { "s were" });
+        notes.push(format!("{n} DICOM file{were} left out: {first}"));
     }
-    let preface = arrange(&mut series, &mut notes)?;
+    let preface = arrange(&mut series, &choice.pick, &mut notes)?;
     let read = |slice: &Slice| pixels(slice, preface.number).map_err(|p| in_file(&slice.path, p));
     // After the first byte a problem can't be told in full, and most are those of all slices.
     let mut first = Some(read(&series.slices[0])?);
@@ -148,9 +156,8 @@ fn in_file(path: &Path, mut p: Problem) -> Problem {
 }
 
 /// Reads the headers of all files. Returns the series, the number of files without a picture, and
-/// the problems of files of a kind that is not read. A damaged file is an error: it may be a slice
-/// of the chosen series.
-fn gather(files: &[PathBuf]) -> Result<(Vec<Series>, usize, Vec<Problem>), Problem> {
+/// the problems of files that are damaged or of a kind that is not read.
+fn gather(files: &[PathBuf]) -> Result<(Vec<Series>, usize, Vec<(PathBuf, Problem)>), Problem> {
     let mut all: BTreeMap<(String, u16, u16, String), Series> = BTreeMap::new();
     let (mut left_out, mut unread) = (0, Vec::new());
     for path in files {
@@ -162,19 +169,17 @@ fn gather(files: &[PathBuf]) -> Result<(Vec<Series>, usize, Vec<Problem>), Probl
                 left_out += 1;
                 continue;
             }
-            Err(p) if p.kind == OpenErrorKind::Unsupported => {
-                unread.push(in_file(path, p));
+            Err(p) => {
+                unread.push((path.clone(), in_file(path, p)));
                 continue;
             }
-            Err(p) => return Err(in_file(path, p)),
         };
         let slices = match slices(path, &mut file) {
             Ok(slices) => slices,
-            Err(p) if p.kind == OpenErrorKind::Unsupported => {
-                unread.push(in_file(path, p));
+            Err(p) => {
+                unread.push((path.clone(), in_file(path, p)));
                 continue;
             }
-            Err(p) => return Err(in_file(path, p)),
         };
         let get = |tag: Tag| file.text(tag).unwrap_or_default();
         for slice in slices {
@@ -319,6 +324,22 @@ impl Slice {
                 "leave it out",
             );
         }
+        let has = |tag: Tag, word: &str| file.text(tag).is_some_and(|t| t.contains(word));
+        if has((0x0008, 0x0008), "MOSAIC") {
+            return refuse(
+                "ImageType",
+                "is MOSAIC: all slices of a time lie side by side in one picture (Siemens)".into(),
+                "convert the series with dcm2niix",
+            );
+        }
+        if file.text((0x0028, 0x3000)).is_some() {
+            return refuse(
+                "ModalityLUTSequence",
+                "gives the values by a table, which is not read".into(),
+                "apply it, for instance with pydicom's apply_modality_lut, and save the result",
+            );
+        }
+        let palette = has((0x0028, 0x0004), "PALETTE");
         let allocated = need((0x0028, 0x0100))?;
         let stored = file.short((0x0028, 0x0101)).unwrap_or(allocated);
         let high = file.short((0x0028, 0x0102)).unwrap_or(stored.saturating_sub(1));
@@ -398,6 +419,7 @@ impl Slice {
             thickness_note,
             native_bytes,
             frame: None,
+            palette,
         })
     }
 
@@ -438,9 +460,9 @@ fn leading_number(text: &str) -> Option<f64> {
 }
 
 /// Sorts the slices, checks that they agree, and returns the preface with their lattice.
-fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Problem> {
+fn arrange(series: &mut Series, pick: &Pick, notes: &mut Vec<String>) -> Result<Preface, Problem> {
     let name = series.name();
-    let count = series.slices.len();
+    let mut count = series.slices.len();
     let slices = &mut series.slices;
     let first = &slices[0];
     let format = first.format;
@@ -468,6 +490,9 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
             padded.len()
         ));
     }
+    if slices.iter().any(|s| s.palette) {
+        notes.push("its colours come from a palette; the stored indices were read".into());
+    }
     if slices.iter().any(|s| s.format != format) {
         notes.push(format!(
             "the slices of {} differ in BitsAllocated, BitsStored, HighBit or PixelRepresentation; \
@@ -475,7 +500,6 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
             quoted(&name)
         ));
     }
-    let dims = [u32::from(format.columns), u32::from(format.rows), count as u32];
     let placed = slices.iter().all(|s| s.place.is_some());
     let lattice = if placed {
         let (_, [row, column]) = first.place.expect("all have one");
@@ -483,16 +507,11 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
         let along = |s: &Slice| s.place.map_or(0.0, |(p, _)| p.dot(normal));
         slices
             .sort_by(|a, b| along(a).total_cmp(&along(b)).then(a.instance.total_cmp(&b.instance)));
+        pick_one_time(slices, &along, pick, notes)?;
+        count = slices.len();
         let gaps: Vec<f64> = slices.windows(2).map(|w| along(&w[1]) - along(&w[0])).collect();
         let (least, most) =
             gaps.iter().fold((f64::INFINITY, 0.0f64), |(a, b), g| (a.min(*g), b.max(*g)));
-        if least <= 1e-4 * most || !gaps.is_empty() && most == 0.0 {
-            return Err(Problem::unsupported(
-                "ImagePositionPatient",
-                "is the same for two slices: there are several times or echoes",
-                "give a folder with one of them",
-            ));
-        }
         if most > 1.05 * least {
             notes.push(format!(
                 "the slices of {} are {} to {} mm apart, and are drawn as if they were even; some \
@@ -515,6 +534,7 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
         };
         // LPS to RAS. Adding zero turns -0.0 into 0.0.
         let ras = |v: DVec3| v * DVec3::new(-1.0, -1.0, 1.0) + DVec3::ZERO;
+        let dims = [u32::from(format.columns), u32::from(format.rows), count as u32];
         Lattice { dims, steps: [ras(row), ras(column), ras(step)], origin: ras(origin) }
     } else {
         slices.sort_by(|a, b| a.instance.total_cmp(&b.instance).then(a.path.cmp(&b.path)));
@@ -523,6 +543,8 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
             quoted(&name)
         ));
         notes.extend(slices[0].thickness_note.clone());
+        pick.choose(&[], "slices")?;
+        let dims = [u32::from(format.columns), u32::from(format.rows), count as u32];
         Lattice::from_spacing(dims, slices[0].spacing)
     };
     lattice
@@ -531,6 +553,11 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
     // One rescale for all slices goes into the value map; several turn all samples into floats.
     let rescale = slices[0].rescale;
     let float = slices.iter().any(|s| s.rescale != rescale);
+    if float {
+        notes.push(
+            "each slice has a slope and an intercept of its own; its values became float32".into(),
+        );
+    }
     let number = if float { Number::F32 } else { common_number(slices.iter().map(|s| s.format)) };
     Ok(Preface {
         name,
@@ -541,6 +568,46 @@ fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Prob
         float,
         notes: std::mem::take(notes),
     })
+}
+
+/// Leaves one slice at each place of sorted slices, where all places have as many: the picked time
+/// or echo, in the order of instance numbers. `along` is a slice's place along their normal.
+fn pick_one_time(
+    slices: &mut Vec<Slice>,
+    along: &impl Fn(&Slice) -> f64,
+    pick: &Pick,
+    notes: &mut Vec<String>,
+) -> Result<(), Problem> {
+    const FIELD: &str = "ImagePositionPatient";
+    let gaps = slices.windows(2).map(|w| along(&w[1]) - along(&w[0]));
+    let most = gaps.fold(0.0f64, f64::max);
+    let mut places: Vec<Vec<Slice>> = Vec::new();
+    for slice in slices.drain(..) {
+        match places.last_mut() {
+            Some(place) if along(&slice) - along(&place[0]) <= 1e-4 * most => place.push(slice),
+            _ => places.push(vec![slice]),
+        }
+    }
+    let sizes = places.iter().map(Vec::len);
+    let (least, most) = (sizes.clone().min().unwrap_or(1), sizes.max().unwrap_or(1));
+    if least != most {
+        return Err(Problem::unsupported(
+            FIELD,
+            format!(
+                "is the same for up to {most} slices, and for {least} elsewhere: times or echoes \
+                 that are not whole"
+            ),
+            "give a folder with one of them, or convert the series, for instance with dcm2niix",
+        ));
+    }
+    let times = Axis::new(Kind::Time, "times or echoes", most as u64);
+    let (at, said) = pick.choose(&[times], FIELD)?;
+    notes.extend(said);
+    for mut place in places {
+        place.sort_by(|a, b| a.instance.total_cmp(&b.instance).then(a.path.cmp(&b.path)));
+        slices.push(place.swap_remove(at[0] as usize));
+    }
+    Ok(())
 }
 
 /// Returns the type that holds the stored values of all formats.

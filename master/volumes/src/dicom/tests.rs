@@ -87,6 +87,7 @@ pub(crate) fn slice(
     let get = |key: &str, or: &str| {
         more.iter().find(|(k, _)| *k == key).map_or(or, |(_, v)| v).as_bytes().to_vec()
     };
+    put((8, 8), "CS", &get("image_type", "ORIGINAL\\PRIMARY\\AXIAL"));
     put((8, 0x60), "CS", b"CT");
     put((8, 0x103e), "LO", &get("description", "thorax"));
     put((0x18, 0x50), "DS", &get("thickness", "9"));
@@ -96,6 +97,7 @@ pub(crate) fn slice(
     put((0x20, 0x32), "DS", &get("position", &format!("-4\\5\\{z}")));
     put((0x20, 0x37), "DS", &get("orientation", "1\\0\\0\\0\\1\\0"));
     put((0x28, 2), "US", &short(1));
+    put((0x28, 4), "CS", &get("photometric", "MONOCHROME2"));
     put((0x28, 8), "IS", &get("frames", "1"));
     put((0x28, 0x10), "US", &short(pixels.len() as u16 / 3));
     put((0x28, 0x11), "US", &short(3));
@@ -108,6 +110,9 @@ pub(crate) fn slice(
     put((0x28, 0x103), "US", &short(signed));
     put((0x28, 0x1052), "DS", &get("intercept", "-1024"));
     put((0x28, 0x1053), "DS", &get("slope", "1"));
+    if more.iter().any(|(key, _)| *key == "modality_lut") {
+        put((0x28, 0x3000), "SQ", &[0xfe, 0xff, 0, 0xe0, 0, 0, 0, 0]);
+    }
     let words: Vec<u8> = pixels.iter().flat_map(|p| short(*p as u16)).collect();
     if matches!(syntax, Syntax::Rle | Syntax::Lossless) {
         let halves = [1, 0].map(|b| {
@@ -247,17 +252,9 @@ fn dicom_errors_name_file_field_and_remedy() {
         bytes[at..at + to.len()].copy_from_slice(to.as_bytes());
         bytes
     };
-    for (second, say) in [
-        (good(0.0), "ImagePositionPatient: is the same for two slices"),
-        (good(1.0)[..good(1.0).len() - 3].to_vec(), "truncated: 12 bytes are needed and 9"),
-        (good(1.0)[..300].to_vec(), "`2` elements: truncated"),
-        (swap(good(1.0), "1\\0\\0\\0\\1\\0", "1\\0\\0\\x\\1\\0"), "is not 6 numbers"),
-        (with(1.0, "padding", "12"), "`2` PixelData: has 24 bytes, where Rows and Columns want 12"),
-    ] {
-        let dir = folder(&[("1", good(0.0)), ("2", second)]);
-        let e = crate::open(dir.path()).unwrap_err().to_string();
-        assert!(e.contains(say), "want {say:?} in {e}");
-    }
+    let dir = folder(&[("1", good(0.0)), ("2", with(1.0, "padding", "12"))]);
+    let e = crate::open(dir.path()).unwrap_err().to_string();
+    assert!(e.contains("`2` PixelData: has 24 bytes, where Rows and Columns want 12"), "{e}");
     let dir = folder(&[("1", swap(good(0.0), "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.9"))]);
     let e = crate::open(dir.path()).unwrap_err().to_string();
     assert!(
@@ -416,4 +413,107 @@ fn dicom_series_can_be_chosen_by_all_that_a_message_shows() {
     assert!(open(Some("1.9")).is_ok() && open(Some(&format!("{}...", &one[..63]))).is_ok());
     let e = open(Some("1.2.826")).unwrap_err().to_string();
     assert!(e.contains("3 series are called `1.2.826`"), "{e}");
+}
+
+#[test]
+fn dicom_series_of_several_times_gives_the_picked_one() {
+    // Two times of two slices; instance numbers go through the times first.
+    let one = |z: f64, instance: &str, from: i16| {
+        slice(
+            Syntax::Explicit,
+            "1.2",
+            z,
+            &pixels(from),
+            &[("instance", instance), ("intercept", "0")],
+        )
+    };
+    let files = [
+        ("a", one(0.0, "1", 0)),
+        ("b", one(0.0, "2", 100)),
+        ("c", one(3.0, "3", 200)),
+        ("d", one(3.0, "4", 300)),
+    ];
+    let dir = folder(&files);
+    let read = |pick| {
+        let hints = crate::Hints { pick, ..crate::Hints::default() };
+        let opened = crate::open_with(dir.path(), &hints).map_err(|e| e.to_string())?;
+        let v = &opened.volume;
+        assert_eq!(v.lattice.dims, [3, 2, 2]);
+        let values = [0, 6].map(|i| v.summary.map.value(v.samples.code(i)));
+        Ok::<_, String>((values, opened.notes.join("; ")))
+    };
+    let none = Pick::default();
+    let said = "the first of 2 times or echoes was read; --time takes another";
+    assert_eq!(read(none).unwrap(), ([0.0, 200.0], said.into()));
+    for pick in [Pick { volume: Some(1), ..none }, Pick { time: Some(1), ..none }] {
+        assert_eq!(read(pick).unwrap(), ([100.0, 300.0], String::new()));
+    }
+    let e = read(Pick { time: Some(2), ..none }).unwrap_err();
+    assert!(e.ends_with("--time: 2 is not there: the file has 2 times; give 0 to 1"), "{e}");
+    std::fs::remove_file(dir.path().join("d")).unwrap();
+    let e = read(none).unwrap_err();
+    assert!(e.contains("times or echoes that are not whole; give a folder with one"), "{e}");
+}
+
+#[test]
+fn bad_file_beside_a_dicom_series_is_left_out_and_noted_and_refused_if_it_is_the_one_given() {
+    let s = |z: f64| slice(Syntax::Explicit, "1.2", z, &pixels(0), &[]);
+    let bad = slice(Syntax::Explicit, "1.2", 2.0, &pixels(0), &[("orientation", "1\\0\\x")]);
+    let cut = s(2.0).len() - 20;
+    for (bad, say) in [
+        (bad, "`bad.dcm` ImageOrientationPatient: `1\\\\0\\\\x` is not 6 numbers"),
+        (s(2.0)[..cut].to_vec(), "`bad.dcm` elements: truncated"),
+        (s(2.0)[..cut + 17].to_vec(), "`bad.dcm` data: truncated: 12 bytes are needed and 9"),
+    ] {
+        let dir = folder(&[("a", s(0.0)), ("b", s(1.0)), ("bad.dcm", bad)]);
+        let opened = crate::open_with(dir.path(), &crate::Hints::default()).unwrap();
+        assert_eq!(opened.volume.lattice.dims, [3, 2, 2]);
+        let notes = opened.notes.join("; ");
+        let said = format!("1 DICOM file was left out: {say}");
+        assert!(notes.contains(&said), "want {said} in {notes}");
+        assert!(crate::open(&dir.path().join("b")).is_ok(), "as a slice of its series");
+        let e = crate::open(&dir.path().join("bad.dcm")).unwrap_err().to_string();
+        assert!(e.contains(say), "{e}");
+    }
+}
+
+#[test]
+fn dicom_mosaics_and_tables_of_values_are_refused_and_palettes_said() {
+    let open = |more: &[(&str, &str)]| {
+        let dir = folder(&[("1", slice(Syntax::Explicit, "1", 0.0, &pixels(0), more))]);
+        crate::open_with(dir.path(), &crate::Hints::default()).map_err(|e| e.to_string())
+    };
+    let e = open(&[("image_type", "ORIGINAL\\PRIMARY\\M\\ND\\MOSAIC")]).unwrap_err();
+    assert!(e.contains("`1` ImageType: is MOSAIC") && e.contains("dcm2niix"), "{e}");
+    let e = open(&[("modality_lut", "1")]).unwrap_err();
+    assert!(e.contains("`1` ModalityLUTSequence: gives the values by a table"), "{e}");
+    let notes = open(&[("photometric", "PALETTE COLOR")]).unwrap().notes.join("; ");
+    assert!(notes.contains("the stored indices were read"), "{notes}");
+}
+
+#[test]
+fn folder_above_a_series_is_refused_with_the_folder_below() {
+    let dir = tempfile::tempdir().unwrap();
+    let below = dir.path().join("DICOM/S01");
+    std::fs::create_dir_all(&below).unwrap();
+    for z in 0..3 {
+        let bytes = slice(Syntax::Explicit, "1.2", f64::from(z), &pixels(0), &[]);
+        std::fs::write(below.join(format!("IM{z}")), bytes).unwrap();
+    }
+    let said = "give the folder `DICOM/S01` below it, which holds 3 DICOM files";
+    let e = crate::open(dir.path()).unwrap_err().to_string();
+    assert!(e.ends_with(said), "{e}");
+    // A DICOMDIR has no picture of its own.
+    let mut dicomdir = slice(Syntax::Explicit, "1.2", 0.0, &pixels(0), &[]);
+    dicomdir.truncate(dicomdir.len() - 24);
+    std::fs::write(dir.path().join("DICOMDIR"), dicomdir).unwrap();
+    for path in [dir.path().to_path_buf(), dir.path().join("DICOMDIR")] {
+        let e = crate::open(&path).unwrap_err().to_string();
+        assert!(e.contains("holds DICOM files, but no picture") && e.ends_with(said), "{e}");
+    }
+    std::fs::create_dir(dir.path().join("DICOM/S02")).unwrap();
+    std::fs::copy(below.join("IM0"), dir.path().join("DICOM/S02/IM0")).unwrap();
+    let e = crate::open(dir.path()).unwrap_err().to_string();
+    let said = "give a folder below it: `DICOM/S01` (3 DICOM files), `DICOM/S02` (1 DICOM file)";
+    assert!(e.ends_with(said), "{e}");
 }

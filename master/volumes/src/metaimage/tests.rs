@@ -53,7 +53,7 @@ fn metaimage_axes_of_one_sample_after_the_third_are_dropped() {
     assert_eq!(v.lattice.steps, [DVec3::X, DVec3::Y * 2.0, DVec3::Z * 3.0]);
     assert_eq!(v.lattice.origin, DVec3::new(-31.5, 12.25, 7.0));
     for (from, to, say) in [
-        ("3 2 1 1", "1 2 1 3", "DimSize (line 3): `1 2 1 3` is more than one volume"),
+        ("3 2 1 1", "1 2 1 0", "DimSize (line 3): `1 2 1 0` has no samples"),
         ("3 2 1 1", "3 2 1", "is not 4 whole numbers"),
         ("0 0 1 0 0", "0 0 1 5 0", "leads out of the space of its first three axes"),
         ("NDims = 4", "NDims = 2", "NDims (line 2): `2` axes make a picture, not a volume"),
@@ -116,7 +116,7 @@ fn metaimage_errors_name_field_and_remedy() {
         ),
         (
             with("ElementDataFile", "ElementNumberOfChannels = 3\nElementDataFile"),
-            "save one channel",
+            "ElementNumberOfChannels: a voxel is 3 numbers, not one number; take one of them with --channel 0 to 2",
         ),
         (with("ElementDataFile", "NDims = 4\nElementDataFile"), "was given in line 2 with another"),
         (with("ElementDataFile", "HeaderSize = x\nElementDataFile"), "is not a number of bytes"),
@@ -132,4 +132,30 @@ fn metaimage_errors_name_field_and_remedy() {
     }
     let e = open(HEAD, b"").unwrap_err().to_string();
     assert!(e.contains("ElementDataFile: is missing; end the header with"), "{e}");
+}
+
+#[test]
+fn metaimage_takes_one_of_several_volumes_and_one_channel() {
+    let head = "ObjectType = Image\nNDims = 4\nDimSize = 3 2 1 2\nElementType = MET_UCHAR\n\
+                ElementNumberOfChannels = 2\nElementDataFile = LOCAL\n";
+    let data: Vec<u8> = (0..24).collect();
+    let read = |head: &str, pick: Pick| {
+        let source = Source::from_bytes([head.as_bytes(), &data].concat());
+        let (hints, notes) =
+            (crate::Hints { pick, ..crate::Hints::default() }, source.notes.clone());
+        let v = crate::read(source, Path::new("."), "v.mha", &hints).map_err(|p| p.to_string())?;
+        let codes: Vec<u8> = (0..6).map(|i| v.samples.code(i) as u8).collect();
+        Ok::<_, String>((codes, notes.take().join("; ")))
+    };
+    let e = read(head, Pick::default()).unwrap_err();
+    assert!(e.contains("a voxel is 2 numbers, not one number; take one of them"), "{e}");
+    let (codes, notes) = read(head, Pick { channel: Some(1), ..Pick::default() }).unwrap();
+    assert_eq!(codes, [1, 3, 5, 7, 9, 11]);
+    assert!(
+        notes.starts_with("the first of 2 volumes was read; --volume takes another"),
+        "{notes}"
+    );
+    // Channels count faster than volumes.
+    let (codes, _) = read(head, Pick { volume: Some(3), ..Pick::default() }).unwrap();
+    assert_eq!(codes, [13, 15, 17, 19, 21, 23]);
 }

@@ -33,7 +33,7 @@ pub(crate) fn read(
     folder: &Path,
     name: &str,
 ) -> Result<Volume, Problem> {
-    let (cap, notes) = (source.cap, source.notes.clone());
+    let (cap, notes, pick) = (source.cap.clone(), source.notes.clone(), source.pick);
     let mut file = Plain::new(source, gzip);
     let mut bytes = [0; HEADER_2_BYTES];
     file.header(&mut bytes[..HEADER_1_BYTES])?;
@@ -54,7 +54,8 @@ pub(crate) fn read(
         // What ANALYZE keeps in their places has another meaning.
         (header.qform_code, header.sform_code, header.inter, header.units) = (0, 0, 0.0, 2);
     }
-    let layout = header.layout(endian)?;
+    let (layout, part, said) = header.layout(endian, pick)?;
+    said.into_iter().for_each(|note| notes.add(note));
     if !nifti && let Some((stem, _)) = stem(name) {
         let mat = format!("{stem}.mat");
         if let Ok(Inside::File(..)) = Folder::open(folder, "file")?.find(Path::new(&mat)) {
@@ -78,12 +79,13 @@ pub(crate) fn read(
         p.field = format!("{} {}", quoted(&data_name), p.field);
         p
     };
+    let beside = cap.beside.clone();
     let mut data = Source { cap, notes, ..data };
     let gzip = data.head().map_err(in_data)?.starts_with(crate::GZIP);
     let mut data = Plain::new(data, gzip);
     data.skip(offset as u64, "vox_offset").map_err(in_data)?;
-    let (samples, stored, _) = data.samples(&layout).map_err(in_data)?;
-    header.volume(name, anatomical, &layout, lattice, samples, stored)
+    let (samples, stored, _) = data.samples(&layout, part.as_ref()).map_err(in_data)?;
+    header.volume(name, anatomical, &layout, lattice, (samples, stored), &beside)
 }
 
 /// Returns the name of a header's file of samples without its end, and whether its end is in

@@ -195,7 +195,11 @@ fn nifti_applies_slope_and_units() {
 fn nifti_errors_name_field_and_remedy() {
     let file = nifti1(false, 2, [4, 3, 2], Affine::Sform);
     for (at, with, say) in [
-        (70, &[128, 0][..], "datatype: 128 is RGB colours; convert"),
+        (
+            70,
+            &[128, 0][..],
+            "datatype: a voxel is 3 colours (RGB), not one number; take one of them with",
+        ),
         (70, &[32, 0], "datatype: 32 is complex"),
         (70, &[3, 0], "datatype: 3 is not a type"),
         (344, b"ni1", "magic: is the header of a pair"),
@@ -215,8 +219,8 @@ fn nifti_errors_name_field_and_remedy() {
         assert!(e.contains(say), "byte {at}: {e}");
     }
     let series = put(&file, 40, &[4, 0]);
-    let e = open(put(&series, 48, &[5, 0])).unwrap_err().to_string();
-    assert!(e.contains("dim[4]: is 5: there is more than one volume; extract one"), "{e}");
+    let e = open(put(&series, 48, &[0xff, 0xff])).unwrap_err().to_string();
+    assert!(e.contains("dim[4]: is -1; correct it"), "{e}");
     assert!(open(put(&series, 48, &[1, 0])).is_ok(), "a fourth axis of 1 is no axis");
     let e = open(file[..200].to_vec()).unwrap_err().to_string();
     assert!(e.contains("truncated"), "{e}");
@@ -226,4 +230,49 @@ fn nifti_errors_name_field_and_remedy() {
     assert!(e.contains("truncated"), "{e}");
     let e = open(crate::fuzz::gzip(&[&file[..], b"x"].concat())).unwrap_err().to_string();
     assert!(e.contains("goes on after the 24 bytes that are declared"), "{e}");
+}
+
+#[test]
+fn nifti_takes_one_of_several_volumes_or_components() {
+    use crate::pick::Pick;
+    let none = Pick::default();
+    let read = |bytes: Vec<u8>, pick: Pick| {
+        let source = Source::from_bytes(bytes);
+        let hints = crate::Hints { pick, ..crate::Hints::default() };
+        let notes = source.notes.clone();
+        let v = crate::read(source, std::path::Path::new("."), "v.nii", &hints)
+            .map_err(|p| p.to_string())?;
+        assert_eq!(v.lattice.dims, [2, 1, 1]);
+        Ok::<_, String>((
+            (0..2).map(|i| v.samples.code(i) as u8).collect(),
+            notes.take().join("; "),
+        ))
+    };
+    let file = |axes: u8, t: u8, c: u8, datatype: [u8; 2]| {
+        let file = nifti1(false, 2, [2, 1, 1], Affine::Sform);
+        let file = put(&put(&put(&file, 40, &[axes, 0]), 48, &[t, 0]), 50, &[c, 0]);
+        [&put(&file, 70, &datatype)[..352], &(0..12).collect::<Vec<u8>>()].concat()
+    };
+    for packed in [false, true] {
+        let pack = |bytes: Vec<u8>| if packed { crate::fuzz::gzip(&bytes) } else { bytes };
+        let times = || pack(file(4, 6, 1, [2, 0]));
+        let said = "the first of 6 times was read; --time takes another";
+        assert_eq!(read(times(), none).unwrap(), (vec![0, 1], said.to_string()));
+        for pick in [Pick { volume: Some(5), ..none }, Pick { time: Some(5), ..none }] {
+            assert_eq!(read(times(), pick).unwrap(), (vec![10, 11], String::new()));
+        }
+        let e = read(times(), Pick { volume: Some(6), ..none }).unwrap_err();
+        assert_eq!(e, "--volume: 6 is not there: the file has 6 volumes; give 0 to 5");
+        let vectors = || pack(file(5, 2, 3, [2, 0]));
+        let e = read(vectors(), none).unwrap_err();
+        assert!(e.starts_with("dim[5]: a voxel is 3 components, not one number; take one"), "{e}");
+        let pick = Pick { channel: Some(1), time: Some(1), ..none };
+        assert_eq!(read(vectors(), pick).unwrap(), (vec![6, 7], String::new()));
+        let rgb = || pack(file(4, 2, 1, [128, 0]));
+        let pick = Pick { channel: Some(2), time: Some(1), ..none };
+        assert_eq!(read(rgb(), pick).unwrap(), (vec![8, 11], String::new()));
+        let cut = pack(file(4, 60, 1, [2, 0]));
+        let e = read(cut, Pick { volume: Some(59), ..none }).unwrap_err();
+        assert!(e.contains("truncated"), "{e}");
+    }
 }

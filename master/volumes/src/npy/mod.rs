@@ -6,11 +6,13 @@
 
 mod dict;
 
+use crate::data;
 use crate::error::{OpenErrorKind, Problem, quoted};
+use crate::pick::{self, Axis, Part, Pick};
 use crate::plain::{Halves, Plain};
 use crate::raw::RawHints;
 use crate::samples::{self, Endian, Layout, Number, Supply};
-use crate::source::Source;
+use crate::source::{Notes, Source};
 use dict::Dict;
 use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
 use std::io::Read;
@@ -36,13 +38,11 @@ pub(crate) fn read(
     let mut file = Plain::new(source, gzip);
     let notes = file.notes.clone();
     let array = Array::read(&mut |bytes| file.header(bytes))?;
-    let (layout, samples, map, after) = match array.kind {
-        Kind::Number(number) => {
-            let layout = Layout::new(array.dims, number, array.endian, "shape")?;
-            let (samples, map, after) = file.samples(&layout)?;
-            (layout, samples, map, after)
-        }
-        Kind::Half => file.halves(array.dims, array.endian, "shape")?,
+    let layout = array.layout()?;
+    let part = array.part(file.pick, &notes)?;
+    let (samples, map, after) = match array.kind {
+        Kind::Number(_) => file.samples(&layout, part.as_ref())?,
+        Kind::Half => file.halves(&layout, array.endian, part.as_ref())?,
     };
     if after > 0 {
         notes.add(format!("{after} bytes after the array were not read"));
@@ -59,7 +59,7 @@ pub(crate) fn read_archive(
     hints: &RawHints,
     dataset: Option<&str>,
 ) -> Result<Volume, Problem> {
-    let Source { reader, len, cap, notes, .. } = source;
+    let Source { reader, len, cap, pick, notes } = source;
     let mut archive = ZipArchive::new(reader).map_err(|e| zip_problem(&e))?;
     if archive.len() > MEMBERS_MAX {
         return Err(Problem::new(
@@ -110,20 +110,22 @@ pub(crate) fn read_archive(
             Problem::new(OpenErrorKind::Damaged, "header", cause, "get the file again")
         })
     })?;
-    let (number, endian) = match array.kind {
-        Kind::Number(number) => (number, array.endian),
-        Kind::Half => (Number::F32, Endian::Little),
-    };
-    let layout = Layout::new(array.dims, number, endian, "shape")?;
+    let layout = array.layout()?;
+    let part = array.part(pick, &notes)?;
     let twice = if array.kind == Kind::Half { 2 } else { 1 };
     // A member without compression has a checksum, too, which the end of an encoded supply reads.
     let ratio = if plain { 1 } else { 1032 };
     let bytes = if plain { stored.saturating_sub(consumed) } else { stored };
     let supply = Supply::Encoded { name: "zip", bytes, ratio: ratio * twice };
-    let (samples, map) = match array.kind {
-        Kind::Number(_) => samples::read(&mut member, supply, &layout, cap)?,
-        Kind::Half => {
+    let (samples, map) = match (array.kind, &part) {
+        (Kind::Number(_), None) => samples::read(&mut member, supply, &layout, cap)?,
+        (Kind::Number(_), Some(part)) => data::read_part(member, supply, part, &layout, cap)?,
+        (Kind::Half, None) => {
             let mut floats = Halves { inner: member, endian: array.endian };
+            samples::read(&mut floats, supply, &layout, cap)?
+        }
+        (Kind::Half, Some(part)) => {
+            let mut floats = Halves { inner: part.reader(member), endian: array.endian };
             samples::read(&mut floats, supply, &layout, cap)?
         }
     };
@@ -198,6 +200,8 @@ struct Array {
     endian: Endian,
     /// Sizes along x, y and z, the fastest first.
     dims: [u64; 3],
+    /// Sizes of the slower axes, along which there are several volumes.
+    more: Vec<u64>,
     fortran: bool,
 }
 
@@ -250,17 +254,66 @@ impl Array {
         {
             shape.remove(flat);
         }
-        let Ok(mut dims) = <[u64; 3]>::try_from(shape) else {
-            return Err(Problem::unsupported(
-                "shape",
+        if !dict.fortran {
+            shape.reverse();
+        }
+        let refused = |what: String, remedy: &str| Err(Problem::unsupported("shape", what, remedy));
+        let Some((dims, more)) = shape.split_first_chunk::<3>() else {
+            return refused(
                 format!("({sizes}) is not that of a volume, which has three axes"),
-                "save one volume, for instance numpy.save('one.npy', a[0]), or stack its pictures",
+                "stack the pictures of a volume, for instance with numpy.stack",
+            );
+        };
+        if !more.is_empty() && dims[0] <= 4 {
+            return refused(
+                format!("({sizes}) may have {} colours or components along an axis", dims[0]),
+                "save one of them, for instance numpy.save('one.npy', a[..., 0])",
+            );
+        }
+        Ok(Array { kind, endian, dims: *dims, more: more.to_vec(), fortran: dict.fortran })
+    }
+
+    /// Returns the layout of one volume; halves become floats.
+    fn layout(&self) -> Result<Layout, Problem> {
+        let (number, endian) = match self.kind {
+            Kind::Number(number) => (number, self.endian),
+            Kind::Half => (Number::F32, Endian::Little),
+        };
+        Layout::new(self.dims, number, endian, "shape")
+    }
+
+    /// Returns the part of the array that is the picked volume, if there are several.
+    fn part(&self, pick: Pick, notes: &Notes) -> Result<Option<Part>, Problem> {
+        let name = |i: usize| match (self.more.len(), self.fortran) {
+            (1, _) => "volumes".to_string(),
+            (_, true) => format!("along axis {}", 3 + i),
+            (n, false) => format!("along axis {}", n - 1 - i),
+        };
+        let axes: Vec<Axis> = self
+            .more
+            .iter()
+            .enumerate()
+            .map(|(i, size)| Axis::new(pick::Kind::Other, name(i), *size))
+            .collect();
+        let (at, said) = pick.choose(&axes, "shape")?;
+        said.into_iter().for_each(|note| notes.add(note));
+        if axes.is_empty() {
+            return Ok(None);
+        }
+        let sizes = [&self.dims[..], &self.more].concat();
+        let at = [None; 3].into_iter().chain(at.into_iter().map(Some)).collect();
+        let bytes = match self.kind {
+            Kind::Number(number) => number.bytes(),
+            Kind::Half => 2,
+        };
+        let Some(part) = Part::new(&sizes, at, bytes).filter(|_| !self.more.contains(&0)) else {
+            return Err(Problem::malformed(
+                "shape",
+                "has no samples, or more than can be",
+                "save it again with numpy.save",
             ));
         };
-        if !dict.fortran {
-            dims.reverse();
-        }
-        Ok(Array { kind, endian, dims, fortran: dict.fortran })
+        Ok(Some(part))
     }
 
     /// Returns notes on what the array does not say.

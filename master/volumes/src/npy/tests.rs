@@ -110,6 +110,30 @@ fn fastest_axis_of_a_numpy_array_is_x() {
 }
 
 #[test]
+fn numpy_array_of_several_volumes_gives_the_picked_one() {
+    let (c, f) = ("(2, 3, 2, 2, 5)", "(5, 2, 2, 3, 2)");
+    for kind in ["<u2", ">f2", "<f8"] {
+        for (fortran, shape) in [(false, c), (true, f)] {
+            let bytes = npy(1, kind, fortran, shape);
+            let (v, notes) = opened(bytes.clone(), None).unwrap();
+            assert_eq!((v.lattice.dims, v.summary.range()), ([5, 2, 2], (0.0, 19.0)));
+            let axes = if fortran { [3, 4] } else { [1, 0] };
+            for (axis, size) in axes.into_iter().zip([3, 2]) {
+                let said =
+                    format!("the first of {size} along axis {axis} was read; --volume takes");
+                assert!(notes.contains(&said), "{notes}");
+            }
+            for bytes in [bytes.clone(), gzip(&bytes), archive(&[("a.npy", &bytes)], true)] {
+                let pick = Pick { volume: Some(4), ..Pick::default() };
+                let hints = crate::Hints { pick, ..crate::Hints::default() };
+                let v = crate::read(Source::from_bytes(bytes), Path::new("."), "a", &hints);
+                assert_eq!(v.unwrap().summary.range(), (80.0, 99.0), "{kind} {shape}");
+            }
+        }
+    }
+}
+
+#[test]
 fn numpy_archive_with_several_arrays_asks_for_one() {
     let (a, b) = (npy(1, "<u2", false, "(2, 3, 4)"), npy(1, "<f4", false, "(1, 3, 2)"));
     let bytes = archive(&[("ct.npy", &a), ("mask.npy", &b)], true);
@@ -134,7 +158,8 @@ fn numpy_errors_name_field_and_remedy() {
         ("<c8", "(2, 3, 4)", "descr: `<c8` is complex numbers; save plain numbers"),
         ("|O", "(2, 3, 4)", "descr: `|O` is Python objects"),
         ("<f4", "(3, 4)", "shape: (3, 4) is not that of a volume"),
-        ("<f4", "(2, 2, 3, 4)", "shape: (2, 2, 3, 4) is not that of a volume"),
+        ("<f4", "(2, 2, 3, 4)", "shape: (2, 2, 3, 4) may have 4 colours or components"),
+        ("<f4", "(0, 2, 3, 5)", "has no samples"),
         ("<f4", "()", "shape: () is not that of a volume"),
         ("<f4", "(0, 3, 4)", "shape: 4 x 3 x 0 has no samples"),
         ("<f4", "(-1, 3, 4)", "shape: `-1` is no size"),

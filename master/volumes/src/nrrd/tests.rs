@@ -99,10 +99,9 @@ fn nrrd_axes_of_colours_vectors_and_time_are_no_axes_of_space() {
         assert!(open(&head("3 2 1", "kinds: domain domain domain\n"), &[0; 6]).is_ok());
     }
     for (sizes, more, say) in [
-        ("3 2 1 1", "kinds: list domain domain domain\n", "no axis of space: `list`, 3 samples"),
         ("1 3 2", "kinds: scalar space space\n", "no axis of space: `scalar`, 1 sample"),
         ("3 2 1", "space directions: none (1,0,0) (0,1,0)\n", "no axis of space: `none`"),
-        ("2 3 2 2", "kinds: vector space space space\n", "the first axis of 2 x 3 x 2 x 2"),
+        ("2 3 2 2", "kinds: vector space space space\n", "a voxel is 2 components (vector)"),
         ("3 2", "", "3 x 2 samples are a picture of two axes, not a volume; stack"),
         ("3 2", "space directions: (1,0) (0,1)\nspace dimension: 2\n", "a picture of two axes"),
         ("6", "", "6 samples are a row of one axis"),
@@ -127,11 +126,7 @@ fn nrrd_volume_of_one_time_is_read_from_four_dimensions() {
     assert!(read("space: LPST\n").unwrap().anatomical);
     // Times are no slices, however many there are.
     let times = format!("{four}{place}space dimension: 4\n").replace("3 2 1 1", "3 2 1 2");
-    let e = open(&times, &[0; 12]).unwrap_err().to_string();
-    assert!(
-        e.contains("axis 4 of 3 x 2 x 1 x 2 is no axis of space: along the fourth dimension"),
-        "{e}"
-    );
+    assert_eq!(open(&times, &[0; 12]).unwrap().lattice.dims, [3, 2, 1]);
     let skew = format!("{four}{place}space dimension: 4\n").replace("(0,0,3,0)", "(0,0,3,1)");
     let e = open(&skew, &[0; 6]).unwrap_err().to_string();
     assert!(e.contains("does not say where axis 3 runs in three dimensions"), "{e}");
@@ -331,4 +326,44 @@ fn nrrd_errors_name_field_and_remedy() {
     let endless = [b"NRRD0004\n".to_vec(), b"#xxxxxxx\n".repeat(1 << 17)].concat();
     let e = read(Source::from_bytes(endless), Path::new("."), "t").unwrap_err().to_string();
     assert!(e.contains("does not end within 1048576 bytes"), "{e}");
+}
+
+#[test]
+fn nrrd_takes_one_of_several_volumes_and_one_number_of_a_voxel() {
+    let data: Vec<u8> = (0..12).collect();
+    let read = |sizes: &str, more: &str, pick: Pick, packed: bool| {
+        let mut header = RAW.replace("dimension: 3", "dimension: 4").replace("3 2 1", sizes);
+        let mut data = data.clone();
+        if packed {
+            (header, data) = (header.replace("raw", "gzip"), gzip(&data));
+        }
+        let bytes = [b"NRRD0004\n", header.as_bytes(), more.as_bytes(), b"\n", &data].concat();
+        let source = Source::from_bytes(bytes);
+        let notes = source.notes.clone();
+        let hints = crate::Hints { pick, ..crate::Hints::default() };
+        let v =
+            crate::read(source, Path::new("."), "test.nrrd", &hints).map_err(|p| p.to_string())?;
+        assert_eq!(v.lattice.dims, [3, 2, 1]);
+        let codes: Vec<u8> = (0..6).map(|i| v.samples.code(i) as u8).collect();
+        Ok::<_, String>((codes, notes.take().join("; ")))
+    };
+    let (none, nth) = (Pick::default(), |n| Pick { volume: Some(n), ..Pick::default() });
+    let channel = Pick { channel: Some(1), ..Pick::default() };
+    let time = Pick { time: Some(1), ..Pick::default() };
+    for packed in [false, true] {
+        let read = |sizes: &str, more: &str, pick: Pick| read(sizes, more, pick, packed);
+        let list = "kinds: domain domain domain list\n";
+        let first = "the first of 2 volumes (a list) was read; --volume takes another";
+        assert_eq!(read("3 2 1 2", list, none).unwrap(), (vec![0, 1, 2, 3, 4, 5], first.into()));
+        let second = (vec![6, 7, 8, 9, 10, 11], String::new());
+        assert_eq!(read("3 2 1 2", list, nth(1)).unwrap(), second);
+        assert_eq!(read("3 2 1 2", "kinds: space space space time\n", time).unwrap(), second);
+        let odd = (vec![1, 3, 5, 7, 9, 11], String::new());
+        let colours = "kinds: vector domain domain domain\n";
+        assert_eq!(read("2 3 2 1", colours, channel).unwrap(), odd);
+        let e = read("2 3 2 1", colours, none).unwrap_err();
+        assert!(e.contains("a voxel is 2 components (vector), not one number; take one"), "{e}");
+        let e = read("3 2 1 2", list, nth(2)).unwrap_err();
+        assert_eq!(e, "--volume: 2 is not there: the file has 2 volumes; give 0 to 1");
+    }
 }

@@ -14,11 +14,22 @@ fn raw_file_name_gives_size_type_and_byte_order() {
         ("X.3X2X1.UINT16BE.RAW", "uint16", 256.0),
         ("x_3x2x1_int16_be.raw", "int16", 256.0),
         ("short_3x2x1.img", "int16", 1.0),
+        ("short-leg_3x2x1_uint16.raw", "uint16", 1.0),
+        ("big_3x2x1_uint16.raw", "uint16", 1.0),
+        ("be_3x2x1_uint16.raw", "uint16", 1.0),
+        ("to-be-or-not_3x2x1_uint16_big.raw", "uint16", 256.0),
+        ("uint16_be_3x2x1.raw", "uint16", 256.0),
+        ("float_3x2x1_int16.raw", "int16", 1.0),
     ] {
         let v = open(name, &none, &[1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]).unwrap();
         assert_eq!((v.lattice.dims, v.file_type.as_str()), ([3, 2, 1], kind), "{name}");
         assert_eq!(v.summary.map.value(v.samples.code(0)), first, "{name}");
     }
+    let source = Source::from_bytes(vec![0; 12]);
+    let notes = source.notes.clone();
+    read(source, false, "big_3x2x1_uint16.raw", &none).unwrap();
+    let said = "raw numbers: 3x2x1 of uint16, little-endian were taken, by the file's name";
+    assert_eq!(notes.take(), [said]);
     let packed = crate::fuzz::gzip(&[1, 2, 3, 4, 5, 6]);
     let v = open("x_3x2x1_u8.raw.gz", &none, &packed).unwrap();
     assert_eq!(v.samples, Samples::U8(vec![1, 2, 3, 4, 5, 6]));

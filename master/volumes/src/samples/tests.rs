@@ -104,6 +104,35 @@ fn float64_beyond_f32_is_rescaled_and_nan_and_infinity_stay() {
 }
 
 #[test]
+fn one_filler_does_not_take_the_values_of_the_others() {
+    for (filler, number) in [
+        (1e300, Number::F64),
+        (-f64::MAX, Number::F64),
+        (1e30, Number::F64),
+        (-3e38, Number::F32),
+        (1e20, Number::F32),
+    ] {
+        let numbers = [&[0.0, filler, 1000.0, 250.0, -filler][..], &[7.0; 60]].concat();
+        let bytes: Vec<u8> = match number {
+            Number::F32 => numbers.iter().flat_map(|x| (*x as f32).to_le_bytes()).collect(),
+            _ => numbers.iter().flat_map(|x| x.to_le_bytes()).collect(),
+        };
+        let got = read_all(&bytes, 65, number, Endian::Little).unwrap();
+        let v = values(&got);
+        assert_eq!([v[0], v[2], v[3]], [0.0, 1000.0, 250.0]);
+        assert!(v[1].is_nan() && v[4].is_nan(), "{v:?}");
+    }
+    // A hot voxel, a mask, a point in noise, and numbers that are large.
+    for numbers in [[0.0f32, 1.0, 1e12], [0.0, 0.0, 1e30], [1e-17, 2e-17, 1.0], [1e20, 2e20, 3e28]]
+    {
+        let numbers = [&numbers[..], &[numbers[0]; 62]].concat();
+        let bytes: Vec<u8> = numbers.iter().flat_map(|x| x.to_le_bytes()).collect();
+        let got = read_all(&bytes, 65, Number::F32, Endian::Little).unwrap();
+        assert_eq!(got.0, Samples::F32(numbers));
+    }
+}
+
+#[test]
 fn oversized_dimensions_are_refused_before_memory_is_taken() {
     for dims in [[0, 1, 1], [16385, 1, 1], [16384, 16384, 16384], [u64::MAX; 3]] {
         assert!(Layout::new(dims, Number::F64, Endian::Little, "sizes").is_err(), "{dims:?}");

@@ -2,6 +2,7 @@
 //! slices of one channel and time, and how far apart samples are.
 
 use crate::error::{Problem, quoted};
+use crate::pick::{Axis, Kind, Pick};
 use crate::units::Step;
 
 /// Description of the first page.
@@ -31,10 +32,11 @@ pub(super) enum Writer {
     Shaped,
 }
 
-/// Pages that are slices: `count` of them from the first, `stride` apart, of `total` that the
+/// Pages that are slices: `count` of them from page `first`, `stride` apart, of `total` that the
 /// description tells of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Slices {
+    pub(super) first: u64,
     pub(super) count: u64,
     pub(super) stride: u64,
     pub(super) total: u64,
@@ -55,24 +57,39 @@ impl Description {
         }
     }
 
-    /// Returns which pages are slices: those of the first channel and time. Notes the others.
-    pub(super) fn slices(&mut self) -> Option<Slices> {
+    /// Returns which pages are slices: those of the picked channel and time, by default the first.
+    /// Notes what was not asked for.
+    pub(super) fn slices(&mut self, pick: &Pick) -> Result<Option<Slices>, Problem> {
         if self.axes.is_empty() {
-            return None;
+            pick.choose(&[], "ImageDescription")?;
+            return Ok(None);
         }
         let total = self.axes.iter().try_fold(1u64, |n, a| n.checked_mul(a.1)).unwrap_or(u64::MAX);
         let is_other = |name: &str| ["channels", "times", "samples"].contains(&name);
         let z = self.axes.iter().rposition(|a| a.0 == "slices");
         // An axis of another name is z if none is called so.
         let z = z.or_else(|| self.axes.iter().rposition(|a| !is_other(&a.0) && a.1 > 1));
-        for (i, (name, n)) in self.axes.iter().enumerate() {
-            if *n > 1 && Some(i) != z {
-                self.notes.push(format!("the first of {n} {name} was read"));
-            }
-        }
-        let stride =
-            z.map_or(1, |z| self.axes[z + 1..].iter().fold(1u64, |n, a| n.saturating_mul(a.1)));
-        Some(Slices { count: z.map_or(1, |z| self.axes[z].1), stride, total })
+        // Pages from one index to the next along an axis.
+        let stride = |i: usize| self.axes[i + 1..].iter().fold(1u64, |n, a| n.saturating_mul(a.1));
+        let others: Vec<usize> = (0..self.axes.len()).rev().filter(|i| Some(*i) != z).collect();
+        let axis = |&i: &usize| {
+            let (name, size) = &self.axes[i];
+            let kind = match name.as_str() {
+                "channels" | "samples" => Kind::Channel,
+                "times" => Kind::Time,
+                _ => Kind::Other,
+            };
+            Axis::new(kind, name, *size)
+        };
+        let list: Vec<Axis> = others.iter().map(axis).collect();
+        let (at, notes) = pick.choose(&list, "ImageDescription")?;
+        let first = others
+            .iter()
+            .zip(at)
+            .fold(0u64, |first, (&i, at)| first.saturating_add(at.saturating_mul(stride(i))));
+        let (count, stride) = z.map_or((1, 1), |z| (self.axes[z].1, stride(z)));
+        self.notes.extend(notes);
+        Ok(Some(Slices { first, count, stride, total }))
     }
 }
 

@@ -134,7 +134,11 @@ fn by_hand(text: &str, planes: u32, pages: u32, bytes: u16, photometric: u16) ->
 }
 
 fn noted(bytes: Vec<u8>) -> Result<(Volume, String), Problem> {
-    let hints = crate::Hints::default();
+    picked(bytes, Pick::default())
+}
+
+fn picked(bytes: Vec<u8>, pick: Pick) -> Result<(Volume, String), Problem> {
+    let hints = crate::Hints { pick, ..crate::Hints::default() };
     let opened = crate::read_noted(Source::from_bytes(bytes), Path::new("."), "t.tif", &hints)?;
     Ok((opened.volume, opened.notes.join("\n")))
 }
@@ -168,6 +172,12 @@ fn tiff_channels_and_times_are_axes_and_the_first_is_read() {
         let want = (0..3).flat_map(|z| (0..12).map(move |i| z * stride * 12 + i)).collect();
         assert_eq!(v.samples, Samples::U8(want), "{text}");
         assert!(notes.contains(say), "{text}: {notes}");
+        let second = Pick { volume: Some(1), ..Pick::default() };
+        let (v, notes) = picked(by_hand(&text, 6, 6, 1, 1), second).unwrap();
+        let first = if stride == 1 { 3 } else { 1 };
+        let want = (0..3).flat_map(|z| (0..12).map(move |i| (first + z * stride) * 12 + i));
+        assert_eq!(v.samples, Samples::U8(want.collect()), "{text}");
+        assert!(!notes.contains(say), "{text}: {notes}");
     }
     // Frames alone are no slices.
     let (v, notes) =

@@ -2,7 +2,7 @@
 //!
 //! With raw appended data the file is no valid XML, so it is read as a stream of tags. One array is
 //! drawn: the active scalars of the points, else the first array with one number a point, else with
-//! one a cell.
+//! one a cell. Points and cells that VTK's masks hide (`vtkGhostType`, `vtkValidPointMask`) become NaN.
 //!
 //! Binary data begin with a header of 32- or 64-bit numbers (`header_type`). Plain data have the
 //! number of bytes; compressed data have the number of blocks, the size of a whole one, the size of
@@ -15,12 +15,13 @@ mod tags;
 use crate::error::{Problem, quoted};
 use crate::limit::ByteCap;
 use crate::samples::{self, Endian, Layout, Number, Supply};
-use crate::source::{Notes, Source, Stream};
+use crate::source::{BUFFER_BYTES, Notes, Source, Stream};
 use crate::unpack::{Base64, Encoding};
 use blocks::Blocks;
 use glam::{DMat3, DVec3};
 use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
 use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::sync::{Arc, Mutex};
 use tags::{Tag, Tags};
 
 const RESAVE: &str = "save it again as one ImageData piece with VTK or ParaView";
@@ -35,77 +36,230 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// Reads a volume from the start of a source.
 pub(crate) fn read(source: Source, name: &str) -> Result<Volume, Problem> {
-    let (len, cap) = (source.len, source.cap);
-    let mut tags = Tags::new(source.reader);
-    let (mut file, mut image, mut section) = (None, None, None);
-    // The array to draw, if its data are appended, and its offset in the appended data.
-    let mut appended: Option<(Array, u64)> = None;
-    let outside = |tag: &Tag| {
-        Problem::malformed(tag.name.as_str(), "does not stand inside ImageData", RESAVE)
+    let (len, cap, notes) = (source.len, source.cap.clone(), source.notes.clone());
+    let stream = SharedStream(Arc::new(Mutex::new(source.reader.into_inner())));
+    let arrays = Arrays::find(stream.reader(0)?)?;
+    let Arrays { file, image, drawn, names, .. } = &arrays;
+    let (array, place) = drawn;
+    if names.len() > 1 {
+        let others: Vec<String> =
+            names.iter().filter(|n| **n != array.name).take(8).map(|n| quoted(n)).collect();
+        notes.add(format!(
+            "the array {} was read, and {} {} not",
+            quoted(&array.name),
+            others.join(", "),
+            if others.len() == 1 { "was" } else { "were" }
+        ));
+    }
+    let open = |place: &Place| -> Result<(DataFormat, BufReader<Box<dyn Stream>>, u64), Problem> {
+        let (format, start) = arrays.start(place, len)?;
+        Ok((format, stream.reader(start)?, len - start))
     };
-    while let Some(tag) = tags.next()? {
-        match tag.name.as_str() {
-            "VTKFile" => file = Some(File::from_tag(&tag)?),
-            "ImageData" => image = Some(Image::from_tag(&tag)?),
-            "Piece" => image.as_mut().ok_or_else(|| outside(&tag))?.check_piece(&tag)?,
-            "PointData" => section = Some(Section::from_tag(&tag, false)),
-            "CellData" => section = Some(Section::from_tag(&tag, true)),
-            "/PointData" | "/CellData" => section = None,
-            "DataArray" if appended.is_none() => {
-                let Some(section) = &section else { continue };
-                let Some(array) = section.select(&tag)? else { continue };
-                let file = file.as_ref().ok_or_else(|| outside(&tag))?;
-                let image = image.as_ref().ok_or_else(|| outside(&tag))?;
-                let format = match tag.required("format")? {
-                    "appended" => {
-                        tag.required("offset")?;
-                        let [offset] = tag.numbers::<u64, 1>("offset")?.unwrap_or_default();
-                        appended = Some((array, offset));
-                        continue;
-                    }
-                    "ascii" => DataFormat::Text,
-                    "binary" => DataFormat::Base64,
-                    _ => return Err(tag.bad("format", "ascii, binary or appended")),
-                };
-                let left = len.saturating_sub(tags.offset);
-                return finish(file, image, &array, (format, tags.reader, left), (name, cap));
-            }
-            "AppendedData" => {
-                let Some((array, offset)) = &appended else { break };
-                let file = file.as_ref().ok_or_else(|| outside(&tag))?;
-                let image = image.as_ref().ok_or_else(|| outside(&tag))?;
-                let format = match tag.required("encoding")? {
-                    "raw" => DataFormat::Raw,
-                    "base64" => DataFormat::Base64,
-                    _ => return Err(tag.bad("encoding", "raw or base64")),
-                };
-                let left = if tags.skip_past(b'_')? { len.saturating_sub(tags.offset) } else { 0 };
-                if *offset >= left {
-                    return Err(Problem::malformed(
-                        format!("DataArray {} offset", quoted(&array.name)),
-                        format!("{offset} lies past the end of the file"),
-                        "get the whole file",
-                    ));
-                }
-                let mut reader = tags.reader;
-                reader
-                    .seek(SeekFrom::Current(*offset as i64))
-                    .map_err(|e| Problem::io("AppendedData", &e))?;
-                return finish(file, image, array, (format, reader, left - offset), (name, cap));
-            }
-            _ => {}
+    // Masks first: none may be kept for writing.
+    let mut hidden: Vec<bool> = Vec::new();
+    for (mask, place) in arrays.masks.iter().filter(|(mask, _)| mask.cells == array.cells) {
+        let (dims, _) = image.dims_and_origin(mask.cells)?;
+        let layout = Layout::new(dims, mask.number, file.endian, "ImageData WholeExtent")?;
+        let cap = ByteCap { asked: cap.asked, ..ByteCap::default() };
+        let (codes, map) = read_array(file, &layout, open(place)?, cap).map_err(|mut p| {
+            p.field = format!("DataArray {} {}", quoted(&mask.name), p.field);
+            p
+        })?;
+        hidden.resize(codes.len(), false);
+        let flags = hidden.iter_mut().enumerate();
+        let count = flags.fold(0u64, |count, (i, hidden)| {
+            let hides = mask.hides(map.value(codes.code(i)) as i64);
+            *hidden |= hides;
+            count + u64::from(hides)
+        });
+        if count > 0 {
+            notes.add(format!(
+                "{count} of {} {} are blanked by {}, and have no value",
+                codes.len(),
+                if mask.cells { "cells" } else { "points" },
+                quoted(&mask.name)
+            ));
         }
     }
-    Err(match (file, appended) {
-        (None, _) => Problem::malformed("VTKFile", "is missing", RESAVE),
-        (_, Some(_)) => Problem::malformed("AppendedData", "is missing", "get the whole file"),
-        _ => Problem::unsupported(
-            "DataArray",
-            "there is none with one number a point or cell",
-            "save a volume with one component",
-        ),
-    })
+    let beside = cap.beside.clone();
+    let mut volume = finish(file, image, array, open(place)?, (name, cap))?;
+    if hidden.contains(&true) {
+        // The numbers would show what is not there.
+        beside.take_numbers();
+        let code = |(i, hidden): (usize, bool)| match hidden {
+            true => f32::NAN,
+            false => volume.samples.code(i) as f32,
+        };
+        let mut codes = Vec::new();
+        samples::reserve(&mut codes, hidden.len())?;
+        codes.extend(hidden.into_iter().enumerate().map(code));
+        let (lattice, map) = (volume.lattice, volume.summary.map);
+        volume = Volume::new(name, array.number.name(), false, lattice, Samples::F32(codes), map);
+    }
+    Ok(volume)
 }
+
+/// A stream that several readers take turns with.
+#[derive(Clone)]
+struct SharedStream(Arc<Mutex<Box<dyn Stream>>>);
+
+impl SharedStream {
+    /// Returns a reader from a place of the file on. It ends the use of those before it.
+    fn reader(&self, start: u64) -> Result<BufReader<Box<dyn Stream>>, Problem> {
+        let mut stream = self.clone();
+        stream.seek(SeekFrom::Start(start)).map_err(|e| Problem::io("content", &e))?;
+        Ok(BufReader::with_capacity(BUFFER_BYTES, Box::new(stream)))
+    }
+
+    fn stream(&self) -> std::sync::MutexGuard<'_, Box<dyn Stream>> {
+        self.0.lock().unwrap_or_else(|e| e.into_inner())
+    }
+}
+
+impl Read for SharedStream {
+    fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
+        self.stream().read(buf)
+    }
+}
+
+impl Seek for SharedStream {
+    fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
+        self.stream().seek(to)
+    }
+}
+
+/// Where an array's data are.
+enum Place {
+    /// After its tag, at this place of the file.
+    Inline(DataFormat, u64),
+    /// At this offset in the appended data.
+    Appended(u64),
+}
+
+/// The arrays of a file that matter, and where their data are.
+struct Arrays {
+    file: File,
+    image: Image,
+    /// The array that is drawn.
+    drawn: (Array, Place),
+    /// Names of all arrays with one number a point, or a cell.
+    names: Vec<String>,
+    /// Arrays that say which points or cells are not there.
+    masks: Vec<(Array, Place)>,
+    /// Format and place of the appended data.
+    appended: Option<(DataFormat, u64)>,
+}
+
+impl Arrays {
+    /// Goes through the tags up to the appended data.
+    fn find(reader: BufReader<Box<dyn Stream>>) -> Result<Arrays, Problem> {
+        let mut tags = Tags::new(reader);
+        let (mut file, mut image, mut section) = (None, None, None);
+        let (mut drawn, mut names, mut masks): (Option<(Array, Place)>, _, _) =
+            (None, Vec::new(), Vec::new());
+        let mut appended = None;
+        let outside = |tag: &Tag| {
+            Problem::malformed(tag.name.as_str(), "does not stand inside ImageData", RESAVE)
+        };
+        loop {
+            let tag = match tags.next() {
+                Ok(Some(tag)) => tag,
+                Ok(None) => break,
+                // Where the drawn array is, is known.
+                Err(_) if matches!(drawn, Some((_, Place::Inline(..)))) => break,
+                Err(p) => return Err(p),
+            };
+            match tag.name.as_str() {
+                "VTKFile" => file = Some(File::from_tag(&tag)?),
+                "ImageData" => image = Some(Image::from_tag(&tag)?),
+                "Piece" => image.as_mut().ok_or_else(|| outside(&tag))?.check_piece(&tag)?,
+                "PointData" => section = Some(Section::from_tag(&tag, false)),
+                "CellData" => section = Some(Section::from_tag(&tag, true)),
+                "/PointData" | "/CellData" => section = None,
+                "DataArray" => {
+                    let Some(section) = &section else { continue };
+                    let name = tag.get("Name").unwrap_or_default();
+                    let is_mask = MASKS.contains(&name);
+                    if !is_mask && is_single(&tag) && names.len() < NAMES_MAX {
+                        names.push(name.to_string());
+                    }
+                    let found = match is_mask {
+                        true => Some(section.array(&tag)?),
+                        false if drawn.is_none() => section.select(&tag)?,
+                        false => None,
+                    };
+                    let Some(array) = found else { continue };
+                    if file.is_none() || image.is_none() {
+                        return Err(outside(&tag));
+                    }
+                    let place = match tag.required("format")? {
+                        "appended" => {
+                            tag.required("offset")?;
+                            let [offset] = tag.numbers::<u64, 1>("offset")?.unwrap_or_default();
+                            Place::Appended(offset)
+                        }
+                        "ascii" => Place::Inline(DataFormat::Text, tags.offset),
+                        "binary" => Place::Inline(DataFormat::Base64, tags.offset),
+                        _ => return Err(tag.bad("format", "ascii, binary or appended")),
+                    };
+                    match is_mask {
+                        true if masks.len() < MASKS.len() => masks.push((array, place)),
+                        true => {}
+                        false => drawn = Some((array, place)),
+                    }
+                }
+                "AppendedData" => {
+                    let format = match tag.required("encoding")? {
+                        "raw" => DataFormat::Raw,
+                        "base64" => DataFormat::Base64,
+                        _ => return Err(tag.bad("encoding", "raw or base64")),
+                    };
+                    let start = if tags.skip_past(b'_')? { tags.offset } else { u64::MAX };
+                    appended = Some((format, start));
+                    break;
+                }
+                _ => {}
+            }
+        }
+        match (file, image, drawn) {
+            (Some(file), Some(image), Some(drawn)) => {
+                Ok(Arrays { file, image, drawn, names, masks, appended })
+            }
+            (None, ..) => Err(Problem::malformed("VTKFile", "is missing", RESAVE)),
+            _ => Err(Problem::unsupported(
+                "DataArray",
+                "there is none with one number a point or cell",
+                "save a volume with one component",
+            )),
+        }
+    }
+
+    /// Returns the format and the place in the file, of `len` bytes, of an array's data.
+    fn start(&self, place: &Place, len: u64) -> Result<(DataFormat, u64), Problem> {
+        let offset = match place {
+            Place::Inline(format, start) => return Ok((*format, (*start).min(len))),
+            Place::Appended(offset) => *offset,
+        };
+        let Some((format, start)) = self.appended else {
+            return Err(Problem::malformed("AppendedData", "is missing", "get the whole file"));
+        };
+        match start.checked_add(offset) {
+            Some(start) if start < len => Ok((format, start)),
+            _ => Err(Problem::malformed(
+                format!("DataArray {} offset", quoted(&self.drawn.0.name)),
+                format!("{offset} lies past the end of the file"),
+                "get the whole file",
+            )),
+        }
+    }
+}
+
+/// Arrays by which VTK marks points and cells that are not there, or that another piece has. They
+/// are never the volume.
+const MASKS: [&str; 4] =
+    ["vtkGhostType", "vtkValidPointMask", "vtkValidCellMask", "vtkGhostLevels"];
+/// Most names kept for the note on other arrays.
+const NAMES_MAX: usize = 64;
 
 /// Attributes of the `VTKFile` element.
 struct File {
@@ -226,19 +380,28 @@ impl Section {
     /// Returns the array of a `DataArray` tag if it is the one to draw.
     fn select(&self, tag: &Tag) -> Result<Option<Array>, Problem> {
         let name = tag.get("Name").unwrap_or_default();
-        let one = matches!(tag.get("NumberOfComponents"), None | Some("" | "0" | "1"));
+        let one = is_single(tag);
         match &self.scalars {
-            Some(scalars) if scalars != name => return Ok(None),
-            Some(_) if !one => {
+            // Active scalars that are no volume say nothing.
+            Some(scalars) if scalars != name && !MASKS.contains(&scalars.as_str()) => {
+                return Ok(None);
+            }
+            Some(scalars) if scalars == name && !one => {
                 return Err(Problem::unsupported(
                     format!("DataArray {}", quoted(name)),
                     "has several numbers a point",
                     "save one component as the active scalars",
                 ));
             }
-            None if !one => return Ok(None),
+            _ if !one => return Ok(None),
             _ => {}
         }
+        self.array(tag).map(Some)
+    }
+
+    /// Returns the array of a `DataArray` tag.
+    fn array(&self, tag: &Tag) -> Result<Array, Problem> {
+        let name = tag.get("Name").unwrap_or_default();
         let number = match tag.required("type")? {
             "Int8" => Number::I8,
             "UInt8" => Number::U8,
@@ -252,7 +415,26 @@ impl Section {
             "Float64" => Number::F64,
             _ => return Err(tag.bad("type", "an integer or float type such as UInt8 or Float32")),
         };
-        Ok(Some(Array { name: name.to_string(), number, cells: self.cells }))
+        Ok(Array { name: name.to_string(), number, cells: self.cells })
+    }
+}
+
+/// Returns whether an array has one number a point or cell.
+fn is_single(tag: &Tag) -> bool {
+    matches!(tag.get("NumberOfComponents"), None | Some("" | "0" | "1"))
+}
+
+impl Array {
+    /// Returns whether a mask's value hides its point or cell: bits of vtkDataSetAttributes, or 0.
+    fn hides(&self, value: i64) -> bool {
+        const HIDDEN_POINT: i64 = 2;
+        const HIDDEN_CELL: i64 = 32;
+        match (self.name.as_str(), self.cells) {
+            ("vtkGhostType", false) => value & HIDDEN_POINT != 0,
+            ("vtkGhostType", true) => value & HIDDEN_CELL != 0,
+            ("vtkValidPointMask" | "vtkValidCellMask", _) => value == 0,
+            _ => false,
+        }
     }
 }
 

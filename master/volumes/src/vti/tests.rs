@@ -161,3 +161,46 @@ fn vti_errors_name_field_and_remedy() {
     let e = open(raw[..at].to_vec()).unwrap_err().to_string();
     assert!(e.contains("truncated"), "{e}");
 }
+
+#[test]
+fn vti_masks_before_or_after_the_array_hide_points_and_cells() {
+    let file = |section: &str, arrays: &[(&str, &str, &str)]| {
+        let arrays: String = arrays
+            .iter()
+            .map(|(kind, name, text)| {
+                format!(
+                    "<DataArray type=\"{kind}\" Name=\"{name}\" format=\"ascii\">{text}</DataArray>"
+                )
+            })
+            .collect();
+        let extent = if section == "CellData" { "0 2 0 2 0 1" } else { "0 1 0 1 0 0" };
+        format!(
+            "<VTKFile type=\"ImageData\"><ImageData WholeExtent=\"{extent}\"><Piece><{section}>\
+             {arrays}</{section}></Piece></ImageData></VTKFile>"
+        )
+    };
+    let v = ("Int64", "v", "5 -6 7 9");
+    for (section, mask, hidden) in [
+        ("PointData", ("UInt8", "vtkGhostType", "0 2 1 3"), [1, 3].as_slice()),
+        ("CellData", ("UInt8", "vtkGhostType", "32 2 1 33"), &[0, 3]),
+        ("PointData", ("Int8", "vtkValidPointMask", "1 0 1 1"), &[1]),
+        ("CellData", ("Int8", "vtkValidCellMask", "1 1 0 1"), &[2]),
+        ("PointData", ("UInt8", "vtkGhostLevels", "1 1 0 0"), &[]),
+    ] {
+        for arrays in [[v, mask], [mask, v]] {
+            let volume = open(file(section, &arrays).into_bytes()).unwrap();
+            let nan: Vec<usize> = (0..4).filter(|&i| volume.samples.code(i).is_nan()).collect();
+            assert_eq!(nan, hidden, "{section} {}", mask.1);
+            let other = if hidden.contains(&0) { (1, -6.0) } else { (0, 5.0) };
+            assert_eq!(volume.summary.map.value(volume.samples.code(other.0)), other.1);
+        }
+    }
+    let two = file("PointData", &[v, ("Int8", "w", "1 2 3 4")]);
+    let source = Source::from_bytes(two.into_bytes());
+    let notes = source.notes.clone();
+    read(source, "two.vti").unwrap();
+    assert_eq!(notes.take(), ["the array `v` was read, and `w` was not"]);
+    let masks = file("PointData", &[("UInt8", "vtkGhostType", "0 2 1 3")]);
+    let e = open(masks.into_bytes()).unwrap_err().to_string();
+    assert!(e.contains("there is none with one number a point or cell"), "{e}");
+}

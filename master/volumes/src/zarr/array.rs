@@ -5,6 +5,7 @@ use super::codec::{Codecs, Shard};
 use super::json::{self, Json};
 use crate::error::{OpenErrorKind, Problem};
 use crate::limit::ByteCap;
+use crate::numbers::Beside;
 use crate::samples::{Endian, Number, reserve};
 use crate::source::{Folder, Inside, not_inside};
 use crate::wide;
@@ -220,12 +221,17 @@ impl Array {
         Ok(())
     }
 
+    /// Returns the grid position of the chunk that holds the volume's first sample.
+    fn first_cell(&self, placed: &Placed) -> Vec<u64> {
+        placed.at.iter().zip(&self.grid).map(|(at, grid)| at / grid).collect()
+    }
+
     /// Returns the bytes of the chunk files, or 0 where the limit does not depend on them. Counts
     /// only until the limit is met.
-    pub(super) fn stored_bytes(&self, cap: ByteCap, placed: &Placed) -> u64 {
+    pub(super) fn stored_bytes(&self, cap: &ByteCap, placed: &Placed) -> u64 {
         let enough = cap.stored_for(placed.bytes(self));
         let mut stored = 0;
-        let mut cell = vec![0u64; self.shape.len()];
+        let mut cell = self.first_cell(placed);
         let count =
             |axis: usize| placed.axes[axis].map_or(1, |a| self.shape[a].div_ceil(self.grid[a]));
         let [nx, ny, nz] = [0, 1, 2].map(count);
@@ -247,8 +253,12 @@ impl Array {
         stored
     }
 
-    /// Reads the samples along the axes of `placed`.
-    pub(super) fn read(&self, placed: &Placed) -> Result<(Samples, ValueMap), Problem> {
+    /// Reads the samples along the axes of `placed`. What codes do not hold is left `beside`.
+    pub(super) fn read(
+        &self,
+        placed: &Placed,
+        beside: &Beside,
+    ) -> Result<(Samples, ValueMap), Problem> {
         let shifted = |offset| ValueMap { scale: 1.0, offset };
         macro_rules! le {
             ($t:ty) => {
@@ -263,21 +273,13 @@ impl Array {
                 let code = |b: &[u8]| le!(u16)(b) ^ 0x8000;
                 (Samples::U16(self.collect(placed, code)?), shifted(-32768.0))
             }
-            Number::F32 => (Samples::F32(self.collect(placed, le!(f32))?), ValueMap::IDENTITY),
+            Number::F32 => wide::without_fillers(self.collect(placed, le!(f32))?, beside)?,
             // Their range decides the codes, so all are kept in their type first.
-            Number::U32 => {
-                wide::compact_integers(self.collect_pieces(placed, le!(u32))?, i128::from)?
-            }
-            Number::I32 => {
-                wide::compact_integers(self.collect_pieces(placed, le!(i32))?, i128::from)?
-            }
-            Number::U64 => {
-                wide::compact_integers(self.collect_pieces(placed, le!(u64))?, i128::from)?
-            }
-            Number::I64 => {
-                wide::compact_integers(self.collect_pieces(placed, le!(i64))?, i128::from)?
-            }
-            Number::F64 => wide::compact_doubles(self.collect_pieces(placed, le!(f64))?)?,
+            Number::U32 => wide::compact_integers(self.collect_pieces(placed, le!(u32))?, beside)?,
+            Number::I32 => wide::compact_integers(self.collect_pieces(placed, le!(i32))?, beside)?,
+            Number::U64 => wide::compact_integers(self.collect_pieces(placed, le!(u64))?, beside)?,
+            Number::I64 => wide::compact_integers(self.collect_pieces(placed, le!(i64))?, beside)?,
+            Number::F64 => wide::compact_doubles(self.collect_pieces(placed, le!(f64))?, beside)?,
         })
     }
 
@@ -353,7 +355,7 @@ impl Array {
         out: &mut [T],
         code: &impl Fn(&[u8]) -> T,
     ) -> Result<(), Problem> {
-        let mut cell = vec![0u64; self.shape.len()];
+        let mut cell = self.first_cell(placed);
         let depth = self.depth(placed) as u64;
         let layer = z as u64 * depth..(z as u64 + 1) * depth;
         if let Some(a) = placed.axes[2] {
@@ -426,7 +428,7 @@ impl Array {
             let wanted = (0..corner.len()).all(|a| match placed.axes {
                 [.., Some(z)] if z == a => layer.contains(&corner[a]) && corner[a] < self.shape[a],
                 axes if axes.contains(&Some(a)) => corner[a] < self.shape[a],
-                _ => corner[a] == 0,
+                _ => (corner[a]..corner[a] + shard.inner[a]).contains(&placed.at[a]),
             });
             if !wanted {
                 continue;
@@ -471,13 +473,19 @@ impl Array {
             }
         };
         let [(x0, nx, sx), (y0, ny, sy), (z0, nz, sz)] = [along(0), along(1), along(2)];
+        // Place in the chunk of the volume's index along the other axes.
+        let other = |a: &usize| !placed.axes.contains(&Some(*a));
+        let base: usize = (0..strides.len())
+            .filter(other)
+            .map(|a| (placed.at[a] - first[a]) as usize * strides[a])
+            .sum();
         let [width, height, _] = placed.dims.map(|n| n as usize);
         let depth = self.depth(placed);
         for z in 0..nz {
             for y in 0..ny {
                 let start = (((z0 + z) % depth) * height + y0 + y) * width + x0;
                 let row = &mut out[start..start + nx];
-                let mut offset = (z * sz + y * sy) * size;
+                let mut offset = (base + z * sz + y * sy) * size;
                 for sample in row {
                     *sample = code(&decoded[offset..offset + size]);
                     offset += sx * size;
@@ -516,8 +524,7 @@ fn separator(asked: Option<Json>, usual: char) -> Result<char, Problem> {
 
 /// Returns the type that version 3 calls `name`.
 fn number(name: &str) -> Option<Number> {
-    let floats = [Number::F32, Number::F64];
-    Number::INTEGERS.into_iter().chain(floats).find(|n| n.name() == name)
+    Number::named(name)
 }
 
 /// Returns the fill value as little-endian bytes of a sample.

@@ -15,6 +15,7 @@ mod json;
 
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::limit::{ByteCap, free_memory};
+use crate::pick::{Axis, Kind, Pick};
 use crate::source::Folder;
 use crate::units::{Step, steps_in_mm};
 use crate::{Hints, Opened};
@@ -41,7 +42,7 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let root = Arc::new(Folder::open(folder, "folder")?);
     if array::is_array(&root, "") {
         let array = Array::open(&root, "")?;
-        let placed = Placed::without_metadata(&array)?;
+        let placed = Placed::without_metadata(&array, &hints.pick)?;
         return read(array, placed, &name, notes, hints.cap());
     }
     let mut group = "";
@@ -69,7 +70,7 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let open = |level: usize| -> Result<(Array, Placed), Problem> {
         let dataset = levels.entry(level);
         let array = Array::open(&root, &path(group, dataset.required("path")?.text()?))?;
-        let placed = axes.place(&array, &image, &dataset)?;
+        let placed = axes.place(&array, (&image, &dataset), &hints.pick)?;
         Ok((array, placed))
     };
     let level = match hints.level {
@@ -132,9 +133,9 @@ fn read(
     };
     array.check_counts(&placed)?;
     // Missing chunks are filled, so no byte need be there for a sample.
-    cap.check(placed.bytes(&array), array.stored_bytes(cap, &placed), "shape")?;
+    cap.check(placed.bytes(&array), array.stored_bytes(&cap, &placed), "shape")?;
     notes.extend(placed.notes.iter().cloned());
-    let (samples, map) = array.read(&placed)?;
+    let (samples, map) = array.read(&placed, &cap.beside)?;
     lattice
         .check()
         .map_err(|e| Problem::malformed("coordinateTransformations", e, "correct the scale"))?;
@@ -165,6 +166,8 @@ pub(crate) struct Placed {
     pub(crate) dims: [u64; 3],
     /// Index of the array's axis for each; `None` where there is one sample.
     pub(crate) axes: [Option<usize>; 3],
+    /// Index along each axis of the array that is none of these; 0 along these.
+    pub(crate) at: Vec<u64>,
     spacing: [f64; 3],
     origin: [f64; 3],
     notes: Vec<String>,
@@ -172,16 +175,14 @@ pub(crate) struct Placed {
 
 impl Placed {
     /// Places an array by the names of its axes. Without names, its last three axes are z, y, x.
-    fn without_metadata(array: &Array) -> Result<Placed, Problem> {
+    fn without_metadata(array: &Array, pick: &Pick) -> Result<Placed, Problem> {
         let rank = array.shape.len();
         let names = array.names.clone().filter(|names| names.len() == rank).unwrap_or_default();
         let axes = match space(&names) {
             Some(axes) => axes,
             None => unnamed_space(array, &names),
         };
-        let mut placed = Placed::new(array, axes, [1.0; 3], [0.0; 3], |a| {
-            names.get(a).filter(|n| !n.is_empty()).map(|n| quoted(n))
-        })?;
+        let mut placed = Placed::new(array, axes, ([1.0; 3], [0.0; 3]), &names, pick)?;
         let named = names.iter().any(|n| !n.is_empty());
         if named && space(&names).is_none() {
             let shown = axes.map(|a| a.map_or("none".into(), |a| quoted(&names[a])));
@@ -194,21 +195,31 @@ impl Placed {
     fn new(
         array: &Array,
         axes: [Option<usize>; 3],
-        spacing: [f64; 3],
-        origin: [f64; 3],
-        name: impl Fn(usize) -> Option<String>,
+        (spacing, origin): ([f64; 3], [f64; 3]),
+        names: &[String],
+        pick: &Pick,
     ) -> Result<Placed, Problem> {
-        let mut notes = Vec::new();
-        for (a, &n) in array.shape.iter().enumerate() {
-            if n > 1 && !axes.contains(&Some(a)) {
-                let name = name(a).unwrap_or_else(|| format!("axis {a}"));
-                notes.push(format!("the first of {n} along {name} was read"));
-            }
-        }
+        // The fastest axis is the last.
+        let others: Vec<usize> =
+            (0..array.shape.len()).rev().filter(|a| !axes.contains(&Some(*a))).collect();
+        let axis = |&a: &usize| {
+            let name = names.get(a).filter(|n| !n.is_empty());
+            let kind = match name.map(|n| n.to_lowercase()).as_deref() {
+                Some("c" | "ch" | "channel" | "channels" | "band" | "component") => Kind::Channel,
+                Some("t" | "time" | "times") => Kind::Time,
+                _ => Kind::Other,
+            };
+            let shown = name.map_or_else(|| format!("axis {a}"), |n| quoted(n));
+            Axis::new(kind, format!("along {shown}"), array.shape[a])
+        };
+        let list: Vec<Axis> = others.iter().map(axis).collect();
+        let (picked, notes) = pick.choose(&list, "shape")?;
+        let mut at = vec![0; array.shape.len()];
+        others.into_iter().zip(picked).for_each(|(a, index)| at[a] = index);
         let dims = axes.map(|a| a.map_or(1, |a| array.shape[a]));
         // Before anything is counted in bytes.
         crate::samples::Layout::new(dims, array.number, array.endian, "shape")?;
-        Ok(Placed { dims, axes, spacing, origin, notes })
+        Ok(Placed { dims, axes, at, spacing, origin, notes })
     }
 
     /// Returns the size of the samples in the file's type, in bytes.
@@ -268,7 +279,12 @@ impl Axes {
     }
 
     /// Places a level by its own scale and translation, then the picture's.
-    fn place(&self, array: &Array, image: &Json, dataset: &Json) -> Result<Placed, Problem> {
+    fn place(
+        &self,
+        array: &Array,
+        (image, dataset): (&Json, &Json),
+        pick: &Pick,
+    ) -> Result<Placed, Problem> {
         let rank = array.shape.len();
         if self.names.len() != rank {
             return Err(Problem::malformed(
@@ -308,8 +324,7 @@ impl Axes {
         });
         let (spacing, mm) = steps_in_mm(&steps, &mut notes);
         let origin = [0, 1, 2].map(|i| axes[i].map_or(0.0, |a| shift[a] * mm[i]));
-        let mut placed =
-            Placed::new(array, axes, spacing, origin, |a| self.names.get(a).map(|n| quoted(n)))?;
+        let mut placed = Placed::new(array, axes, (spacing, origin), &self.names, pick)?;
         placed.notes.extend(notes);
         Ok(placed)
     }

@@ -465,6 +465,16 @@ fn ome_zarr_axes_without_unit_or_z_take_those_of_x_and_say_so() {
 
 /// Opens an array of int16 0, 1, 2, ... in the order of its axes, and returns its volume and notes.
 fn named(shape: &[u64], names: serde_json::Value, version: u64) -> (Volume, String) {
+    picked(shape, names, version, crate::Pick::default())
+}
+
+/// Opens an array whose axes have names, of which `pick` takes a volume.
+fn picked(
+    shape: &[u64],
+    names: serde_json::Value,
+    version: u64,
+    pick: crate::Pick,
+) -> (Volume, String) {
     let dir = tempfile::tempdir().unwrap();
     let count = shape.iter().product::<u64>() as i16;
     let bytes: Vec<u8> = (0..count).flat_map(i16::to_le_bytes).collect();
@@ -486,7 +496,7 @@ fn named(shape: &[u64], names: serde_json::Value, version: u64) -> (Volume, Stri
         put(dir.path(), "zarr.json", meta.to_string().as_bytes());
         put(dir.path(), &format!("c/{}", vec!["0"; shape.len()].join("/")), &bytes);
     }
-    let opened = crate::open_with(dir.path(), &Hints::default()).unwrap();
+    let opened = crate::open_with(dir.path(), &Hints { pick, ..Hints::default() }).unwrap();
     (opened.volume, opened.notes.join("\n"))
 }
 
@@ -510,5 +520,38 @@ fn zarr_axes_go_by_their_names_in_any_order() {
         assert!(notes.contains("taken to be `col`, `row`, `plane`"), "{notes}");
         let (v, notes) = named(&[2, 3, 4], json!([null, null, null]), version);
         assert_eq!((v.lattice.dims, notes.as_str()), ([4, 3, 2], ""));
+    }
+}
+
+#[test]
+fn zarr_takes_the_picked_channel_from_its_chunk() {
+    use crate::Pick;
+    let channel = |n| Pick { channel: Some(n), ..Pick::default() };
+    for version in [2, 3] {
+        let (v, notes) = picked(&[2, 3, 4, 5], json!(["z", "y", "x", "c"]), version, channel(3));
+        assert_eq!(values(&v)[..4], [3, 8, 13, 18]);
+        assert_eq!(notes, "");
+    }
+    // Channels 2 and 3 of five are in the second chunk.
+    let dir = tempfile::tempdir().unwrap();
+    let meta = json!({
+        "zarr_format": 2, "shape": [5, 2, 3, 4], "chunks": [2, 2, 3, 4], "dtype": "<i2",
+        "compressor": null, "fill_value": 0, "filters": null, "order": "C",
+    });
+    put(dir.path(), ".zarray", meta.to_string().as_bytes());
+    put(
+        dir.path(),
+        ".zattrs",
+        json!({"_ARRAY_DIMENSIONS": ["c", "z", "y", "x"]}).to_string().as_bytes(),
+    );
+    for chunk in 0..3i16 {
+        let bytes: Vec<u8> = (0..48).flat_map(|i| (chunk * 48 + i).to_le_bytes()).collect();
+        put(dir.path(), &format!("{chunk}.0.0.0"), &bytes);
+    }
+    for (pick, first) in [(channel(3), 72), (Pick { volume: Some(4), ..Pick::default() }, 96)] {
+        let opened = crate::open_with(dir.path(), &Hints { pick, ..Hints::default() }).unwrap();
+        let want: Vec<i16> = (first..first + 24).collect();
+        assert_eq!(values(&opened.volume), want);
+        assert!(opened.notes.is_empty(), "{:?}", opened.notes);
     }
 }

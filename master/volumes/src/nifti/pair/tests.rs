@@ -73,6 +73,28 @@ fn nifti_pair_opens_by_either_name_plain_and_packed() {
 }
 
 #[test]
+fn pair_of_several_times_gives_the_picked_one() {
+    let (header, samples) = nifti_pair(false, 4, [4, 3, 2]);
+    let mut series = header.clone();
+    series[40..42].copy_from_slice(&4i16.to_le_bytes());
+    series[48..50].copy_from_slice(&2i16.to_le_bytes());
+    let later: Vec<u8> = (100..124i16).flat_map(i16::to_le_bytes).collect();
+    let both = [&samples[..], &later].concat();
+    let (v, notes) = open(&[("a.hdr", &series), ("a.img", &both)], "a.hdr").unwrap();
+    assert_eq!(v.summary.range(), (0.0, 23.0));
+    assert!(notes.contains("the first of 2 times was read; --time takes another"), "{notes}");
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("a.hdr"), &series).unwrap();
+    std::fs::write(folder.path().join("a.img"), &both).unwrap();
+    let pick = crate::Pick { time: Some(1), ..crate::Pick::default() };
+    let hints = crate::Hints { pick, ..crate::Hints::default() };
+    for name in ["a.hdr", "a.img"] {
+        let opened = crate::open_with(&folder.path().join(name), &hints).unwrap();
+        assert_eq!(opened.volume.summary.range(), (100.0, 123.0), "{name}");
+    }
+}
+
+#[test]
 fn analyze_lies_to_the_left_and_says_so() {
     let (_, samples) = nifti_pair(false, 4, [4, 3, 2]);
     let header = analyze(false, 4, [4, 3, 2]);
@@ -116,5 +138,5 @@ fn pair_errors_name_file_field_and_remedy() {
     let mut colours = analyze(false, 128, [4, 3, 2]);
     colours[0..4].copy_from_slice(&348u32.to_le_bytes());
     let e = open(&[("a.hdr", &colours), ("a.img", &samples)], "a.hdr").unwrap_err();
-    assert!(e.contains("datatype: 128 is RGB colours"), "{e}");
+    assert!(e.contains("datatype: a voxel is 3 colours (RGB)"), "{e}");
 }

@@ -141,8 +141,8 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         }
         if !args.input.is_empty() && !args.volume.as_deref().is_some_and(is_here) {
             return Err(Fail::usage(
-                "--dims, --type and the like say what is in a file, and the master has read the \
-                 volume; leave them out, or give a file",
+                "--dims, --type and the like say what is in a file, and with --master the master has \
+                 read the volume; leave them out, or give a file as VOLUME",
             ));
         }
         for (given, flag) in [(args.workers, "workers"), (args.threads, "threads")] {

@@ -327,7 +327,7 @@ fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
     let with = |more: &[&'static str]| [&["render", "good.nrrd"], more].concat();
     vec![
         (vec!["render"], &["VOLUME", "--master"][..]),
-        (vec!["render", "good.nrrd", "--master", "127.0.0.1:1"], &["VOLUME", "--master"]),
+        (vec!["render", "knee", "--master", "127.0.0.1:1", "--skip", "4"], &["--dims", "VOLUME"]),
         (vec!["render", "--master", "127.0.0.1:1", "--workers", "2"], &["--workers"]),
         (vec!["render", "--master", "nowhere:"], &["--master", "HOST:PORT"]),
         (vec!["rendr"], &["rendr", "render"]),
@@ -414,7 +414,7 @@ fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
             &["--listen", "127.0.0.1", "--insecure"],
         ),
         (vec!["master", "--volume", "good.nrrd", "--listen", "7433"], &["--listen", "HOST:PORT"]),
-        (vec!["master"], &["--volume"]),
+        (vec!["master", "--upload-quota", "1"], &["--upload-quota", "16MiB", "0 for none"]),
         (vec!["worker"], &["--master"]),
         (vec!["worker", "--master", "a:1", "--memory", "1"], &["--memory", "512MiB"]),
         (

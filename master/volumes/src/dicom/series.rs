@@ -155,9 +155,12 @@ fn in_file(path: &Path, mut p: Problem) -> Problem {
     p
 }
 
+/// Files that are left out, each with its problem.
+type LeftOut = Vec<(PathBuf, Problem)>;
+
 /// Reads the headers of all files. Returns the series, the number of files without a picture, and
 /// the problems of files that are damaged or of a kind that is not read.
-fn gather(files: &[PathBuf]) -> Result<(Vec<Series>, usize, Vec<(PathBuf, Problem)>), Problem> {
+fn gather(files: &[PathBuf]) -> Result<(Vec<Series>, usize, LeftOut), Problem> {
     let mut all: BTreeMap<(String, u16, u16, String), Series> = BTreeMap::new();
     let (mut left_out, mut unread) = (0, Vec::new());
     for path in files {

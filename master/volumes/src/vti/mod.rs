@@ -51,7 +51,7 @@ pub(crate) fn read(source: Source, name: &str) -> Result<Volume, Problem> {
             if others.len() == 1 { "was" } else { "were" }
         ));
     }
-    let open = |place: &Place| -> Result<(DataFormat, BufReader<Box<dyn Stream>>, u64), Problem> {
+    let open = |place: &Place| -> Result<Data, Problem> {
         let (format, start) = arrays.start(place, len)?;
         Ok((format, stream.reader(start)?, len - start))
     };
@@ -438,6 +438,9 @@ impl Array {
     }
 }
 
+/// An array's data: their encoding, a reader at the first byte, and the bytes left in the file.
+type Data = (DataFormat, BufReader<Box<dyn Stream>>, u64);
+
 /// Encoding of an array's data in the file.
 #[derive(Clone, Copy, PartialEq)]
 enum DataFormat {
@@ -451,7 +454,7 @@ fn finish(
     file: &File,
     image: &Image,
     array: &Array,
-    (format, reader, left): (DataFormat, BufReader<Box<dyn Stream>>, u64),
+    (format, reader, left): Data,
     (name, cap): (&str, ByteCap),
 ) -> Result<Volume, Problem> {
     let (dims, origin) = image.dims_and_origin(array.cells)?;
@@ -477,7 +480,7 @@ fn finish(
 fn read_array(
     file: &File,
     layout: &Layout,
-    (format, reader, left): (DataFormat, BufReader<Box<dyn Stream>>, u64),
+    (format, reader, left): Data,
     cap: ByteCap,
 ) -> Result<(Samples, ValueMap), Problem> {
     if format == DataFormat::Text {

@@ -129,7 +129,8 @@ fn wide_numbers_are_converted_to_the_bit_in_their_type() {
     let doubles = [0.1, -1e300, f64::MIN_POSITIVE / 4.0, f64::INFINITY, -0.0];
     let double = |i: u64| doubles.get(i as usize).copied().unwrap_or(spread(i) as f64).to_bits();
     let filler = |i: u64| u64::from(if i == 3 { -3e38f32 } else { i as f32 }.to_bits());
-    let cases: [(&str, &str, usize, &dyn Fn(u64) -> u64); 8] = [
+    type Case<'a> = (&'a str, &'a str, usize, &'a dyn Fn(u64) -> u64);
+    let cases: [Case<'_>; 8] = [
         ("float32", "float", 4, &filler),
         ("uint32", "uint32", 4, &spread),
         ("int32", "int32", 4, &spread),

@@ -1,0 +1,263 @@
+#!/usr/bin/env python3
+"""Writes small volumes with the peers' own writers, and compares what slabcast reads.
+
+    python3 -m venv venv && venv/bin/pip install nibabel SimpleITK pynrrd tifffile zarr pydicom vtk
+    venv/bin/python tests/peers_files.py target/debug/slabcast
+
+Each file holds 7x5x3 numbers of one type. `slabcast convert` writes it as raw NRRD, whose samples must
+be the peer's to the bit, in the file's type; `slabcast info --json` gives steps and origin, which must
+be the peer's in RAS. Files of several volumes are read by `--volume`, `--time` and `--channel`. A peer
+that is not installed is named, and its files are left out. Exits with 1 if a file differs.
+"""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+
+import numpy as np
+
+DIMS = (7, 5, 3)
+TYPES = ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"]
+NRRD = {"uint8": "u1", "int8": "i1", "uint16": "u2", "int16": "i2", "uint32": "u4", "int32": "i4",
+        "uint64": "u8", "int64": "i8", "float": "f4", "double": "f8"}
+PEERS = ["nibabel", "SimpleITK", "nrrd", "tifffile", "zarr", "pydicom", "vtk"]
+peer = {}
+counts = {}
+
+
+def numbers(kind, more=()):
+    """Numbers over the whole range of a type, x fastest: shape (7, 5, 3, *more)."""
+    rng = np.random.default_rng(7)
+    shape = DIMS + tuple(more)
+    if np.dtype(kind).kind == "f":
+        a = rng.normal(size=shape) * 1e6
+    else:
+        limits = np.iinfo(kind)
+        a = rng.integers(limits.min, limits.max, size=shape, dtype=kind, endpoint=True)
+    return np.asfortranarray(a.astype(kind))
+
+
+def run(*args):
+    return subprocess.run([SLABCAST, *args], capture_output=True, text=True)
+
+
+def samples(path):
+    """Samples of a raw NRRD that slabcast wrote, shape (x, y, z)."""
+    head, data = open(path, "rb").read().split(b"\n\n", 1)
+    fields = dict(l.split(": ", 1) for l in head.decode().splitlines() if ": " in l)
+    sizes = [int(n) for n in fields["sizes"].split()]
+    return np.frombuffer(data, "<" + NRRD[fields["type"]]).reshape(sizes, order="F")
+
+
+def check(writer, path, want, *flags, steps=None, origin=None):
+    """Compares a file: samples to the bit, and steps (rows i, j, k) and origin in RAS, if given."""
+    row = counts.setdefault(writer, [0, 0, 0])
+    said = run("convert", path, "out.nrrd", "--encoding", "raw", "--force", *flags)
+    name = f"{writer} {path} {want.dtype} {' '.join(flags)}"
+    if said.returncode:
+        row[2] += 1
+        print(f"refused: {name}: {said.stderr.strip()[:200]}")
+        return
+    got = samples("out.nrrd")
+    same = got.dtype == want.dtype and np.array_equal(got, want, equal_nan=want.dtype.kind == "f")
+    if same and steps is not None:
+        said = run("info", path, "--json", *flags)
+        if said.returncode:
+            sys.exit(f"{name}: info fails after convert: {said.returncode} {said.stderr}")
+        info = json.loads(said.stdout)
+        same = np.allclose(info["steps"], steps, rtol=1e-6, atol=1e-6)
+        same = same and np.allclose(info["origin"], origin, rtol=1e-6, atol=1e-5)
+    row[0 if same else 1] += 1
+    if not same:
+        print(f"DIFFERS: {name}: {got.dtype} {got.ravel('F')[:3]}, want {want.ravel('F')[:3]}")
+
+
+def nibabel():
+    nib = peer["nibabel"]
+    turned = np.array([[0, -2, 0, 31.5], [1.5, 0, 0, -12.25], [0, 0, 3, 107.75], [0, 0, 0, 1]])
+    for kind in TYPES:
+        for make in (nib.Nifti1Image, nib.Nifti2Image):
+            for order in "<>":
+                a = numbers(kind)
+                image = make(a, turned, dtype=a.dtype)
+                image = make(a, turned, image.header.as_byteswapped(order), dtype=a.dtype)
+                for name in ("a.nii", "a.nii.gz"):
+                    nib.save(image, name)
+                    affine = nib.load(name).affine
+                    check("nibabel", name, a, steps=affine[:3, :3].T, origin=affine[:3, 3])
+        a = numbers(kind, (4,))
+        nib.save(nib.Nifti1Image(a, turned, dtype=a.dtype), "t.nii.gz")
+        for n in (0, 3):
+            check("nibabel, times", "t.nii.gz", a[..., n], "--volume", str(n))
+
+
+def SimpleITK():
+    itk = peer["SimpleITK"]
+    turned = (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    flip = np.array([-1.0, -1.0, 1.0])
+    for kind in TYPES:
+        a = numbers(kind)
+        image = itk.GetImageFromArray(np.ascontiguousarray(a.transpose(2, 1, 0)))
+        image.SetSpacing((0.7, 1.3, 2.9))
+        image.SetOrigin((31.5, -12.25, 107.75))
+        image.SetDirection(turned)
+        steps = (np.array(turned).reshape(3, 3) * (0.7, 1.3, 2.9)).T * flip
+        origin = np.array(image.GetOrigin()) * flip
+        for name in ("a.mha", "a.mhd", "a.nrrd", "a.nhdr", "a.nii", "a.nii.gz"):
+            for packed in (False, True):
+                itk.WriteImage(image, name, packed)
+                check("SimpleITK", name, a, steps=steps, origin=origin)
+        a = numbers(kind, (3,))
+        several = np.ascontiguousarray(a.transpose(3, 2, 1, 0))
+        itk.WriteImage(itk.GetImageFromArray(several, isVector=False), "t.mha")
+        itk.WriteImage(itk.GetImageFromArray(several, isVector=False), "t.nrrd")
+        several = np.ascontiguousarray(a.transpose(2, 1, 0, 3))
+        itk.WriteImage(itk.GetImageFromArray(several, isVector=True), "v.mha")
+        itk.WriteImage(itk.GetImageFromArray(several, isVector=True), "v.nrrd")
+        for n in (0, 2):
+            for name in ("t.mha", "t.nrrd"):
+                check("SimpleITK, volumes", name, a[..., n], "--volume", str(n))
+            for name in ("v.mha", "v.nrrd"):
+                check("SimpleITK, vectors", name, a[..., n], "--channel", str(n))
+
+
+def nrrd():
+    for kind in TYPES:
+        a = numbers(kind)
+        for encoding in ("raw", "gzip", "bzip2", "ascii"):
+            head = {"encoding": encoding, "space": "left-posterior-superior",
+                    "space directions": [[0, 2, 0], [-1.5, 0, 0], [0, 0, 3]],
+                    "space origin": [31.5, -12.25, 107.75]}
+            if encoding == "ascii" and kind in ("u8", "i8", "f4", "f8"):
+                continue  # its text has fewer digits
+            for name in ("a.nrrd", "a.nhdr"):
+                peer["nrrd"].write(name, a, head)
+                steps = np.array(head["space directions"]) * (-1, -1, 1)
+                check("pynrrd", name, a, steps=steps, origin=[-31.5, 12.25, 107.75])
+        a = numbers(kind, (4,))
+        peer["nrrd"].write("l.nrrd", a, {"kinds": ["domain"] * 3 + ["list"]})
+        check("pynrrd, list", "l.nrrd", a[..., 2], "--volume", "2")
+
+
+def tifffile():
+    for kind in TYPES:
+        a = numbers(kind)
+        pages = np.ascontiguousarray(a.transpose(2, 1, 0))
+        for packed in (None, "zlib", "lzw"):
+            for order in "<>":
+                try:
+                    peer["tifffile"].imwrite("a.tif", pages, compression=packed, byteorder=order,
+                                             photometric="minisblack")
+                except (ImportError, KeyError, ValueError):
+                    continue
+                check("tifffile", "a.tif", a)
+        a = numbers(kind, (2,))
+        pages = np.ascontiguousarray(a.transpose(2, 3, 1, 0))
+        peer["tifffile"].imwrite("c.tif", pages, metadata={"axes": "ZCYX"}, photometric="minisblack")
+        names = ["c.tif"]
+        if kind not in ("u8", "i8"):  # OME has no such type
+            peer["tifffile"].imwrite("c.ome.tif", pages, metadata={"axes": "ZCYX"},
+                                     photometric="minisblack")
+            names.append("c.ome.tif")
+        for name in names:
+            check("tifffile, channels", name, a[..., 1], "--channel", "1")
+
+
+def zarr():
+    for kind in TYPES:
+        for version in (2, 3):
+            for chunks in ((3, 5, 7), (2, 2, 4)):
+                a = numbers(kind)
+                z = peer["zarr"].create_array("a.zarr", shape=DIMS[::-1], chunks=chunks, dtype=kind,
+                                              zarr_format=version, overwrite=True)
+                z[:] = a.transpose(2, 1, 0)
+                check("zarr", "a.zarr", a)
+        a = numbers(kind, (3,))
+        z = peer["zarr"].create_array("c.zarr", shape=(3, 3, 5, 7), chunks=(2, 2, 5, 7), dtype=kind,
+                                      overwrite=True, dimension_names=["c", "z", "y", "x"])
+        z[:] = a.transpose(3, 2, 1, 0)
+        check("zarr, channels", "c.zarr", a[..., 2], "--channel", "2")
+
+
+def pydicom():
+    from pydicom.dataset import FileDataset, FileMetaDataset
+    from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+    for kind in ("u1", "u2", "i2"):
+        a = numbers(kind, (2,))
+        os.makedirs(f"dicom_{kind}", exist_ok=True)
+        series = generate_uid()
+        for t in range(2):
+            for k in range(3):
+                meta = FileMetaDataset()
+                meta.MediaStorageSOPClassUID = CTImageStorage
+                meta.MediaStorageSOPInstanceUID = generate_uid()
+                meta.TransferSyntaxUID = ExplicitVRLittleEndian
+                d = FileDataset(None, {}, file_meta=meta, preamble=b"\0" * 128)
+                d.SOPClassUID, d.SOPInstanceUID = CTImageStorage, meta.MediaStorageSOPInstanceUID
+                d.Modality, d.SeriesInstanceUID, d.SeriesNumber = "MR", series, 1
+                d.InstanceNumber = 3 * t + k + 1
+                d.ImagePositionPatient = [31.5, -12.25, 2.5 * k]
+                d.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
+                d.PixelSpacing, d.SliceThickness = [1.25, 0.75], 2.5
+                d.SamplesPerPixel, d.PhotometricInterpretation = 1, "MONOCHROME2"
+                d.Rows, d.Columns = DIMS[1], DIMS[0]
+                d.BitsAllocated = d.BitsStored = 8 * np.dtype(kind).itemsize
+                d.HighBit = d.BitsStored - 1
+                d.PixelRepresentation = int(np.dtype(kind).kind == "i")
+                d.PixelData = np.ascontiguousarray(a[:, :, k, t].T).tobytes()
+                d.PixelData += b"\0" * (len(d.PixelData) % 2)
+                d["PixelData"].VR = "OB" if kind == "u1" else "OW"
+                d.save_as(f"dicom_{kind}/{t}{k}.dcm", enforce_file_format=True)
+        for t in range(2):
+            check("pydicom, times", f"dicom_{kind}", a[..., t], "--time", str(t),
+                  steps=[[-0.75, 0, 0], [0, -1.25, 0], [0, 0, 2.5]], origin=[-31.5, 12.25, 0])
+
+
+def vtk():
+    v = peer["vtk"]
+    from vtk.util.numpy_support import numpy_to_vtk
+    for kind in TYPES:
+        a = numbers(kind)
+        image = v.vtkImageData()
+        image.SetDimensions(DIMS)
+        image.SetSpacing(0.7, 1.3, 2.9)
+        image.SetOrigin(31.5, -12.25, 107.75)
+        array = numpy_to_vtk(a.ravel("F"), deep=True)
+        array.SetName("values")
+        image.GetPointData().SetScalars(array)
+        for mode in ("Ascii", "Binary", "Appended"):
+            if mode == "Ascii" and np.dtype(kind).kind == "f":
+                continue  # its text has fewer digits
+            for packed in (False, True):
+                w = v.vtkXMLImageDataWriter()
+                w.SetFileName("a.vti")
+                w.SetInputData(image)
+                getattr(w, f"SetDataModeTo{mode}")()
+                if not packed:
+                    w.SetCompressorTypeToNone()
+                w.Write()
+                check("VTK", "a.vti", a, steps=np.diag((0.7, 1.3, 2.9)),
+                      origin=(31.5, -12.25, 107.75))
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
+    SLABCAST = os.path.abspath(sys.argv[1])
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        for name in PEERS:
+            try:
+                peer[name] = importlib.import_module(name)
+            except ImportError:
+                print(f"left out: {name} is not installed")
+                continue
+            globals()[name]()
+        os.chdir("/")
+    print("\n| writer | equal | differ | refused |\n|---|--:|--:|--:|")
+    for writer, row in counts.items():
+        print(f"| {writer} | {row[0]} | {row[1]} | {row[2]} |")
+    sys.exit(any(row[1] for row in counts.values()))

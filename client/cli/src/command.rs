@@ -76,7 +76,7 @@ pub(crate) const GROUPS: [(&str, &[&str]); 4] = [
 const EXAMPLES: &str = "\
 Examples:
   slabcast demo                                  pictures without any file
-  slabcast render brain.nii.gz                   18 pictures of a turn, in slabcast-out/
+  slabcast render brain.nii.gz                   36 pictures of a full turn, in slabcast-out/
   slabcast info brain.nii.gz                     what is in the file
   slabcast master --volumes scans/               a cluster: a master,
   slabcast worker --master 127.0.0.1:7433        workers, here or elsewhere,

@@ -205,6 +205,18 @@ fn shown(tf: &TransferFunction, info: &VolumeInfo) -> (f64, f64) {
     if to > from { (from, to) } else { (lo, hi) }
 }
 
+/// Returns the values of the file between which a function shows anything.
+pub fn shown_values(tf: &TransferFunction, info: &VolumeInfo) -> (f64, f64) {
+    let (from, to) = shown(tf, info);
+    match tf.domain {
+        Domain::Value => (from, to),
+        Domain::Unit => {
+            let (lo, hi) = info.summary.range();
+            (lo + (hi - lo) * from, lo + (hi - lo) * to)
+        }
+    }
+}
+
 fn is_name(text: &str) -> bool {
     presets::NAMES.iter().chain(&presets::MAPS).any(|(name, _)| *name == text)
 }

@@ -8,8 +8,8 @@ mod flags;
 mod keep;
 
 pub use flags::{
-    AxisArgs, OpenedVolume, PictureArgs, QualityArgs, SceneArgs, ThreadArgs, ViewArgs,
-    VolumeSceneArgs, WorkArgs,
+    AxisArgs, OpenedVolume, PictureArgs, QualityArgs, SceneArgs, ThreadArgs, UsualTurn,
+    ViewArgs, VolumeSceneArgs, WorkArgs,
 };
 pub use keep::KeepArgs;
 

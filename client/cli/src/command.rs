@@ -2,8 +2,8 @@
 
 use crate::lab::{self, LabArgs, LabCommand};
 use crate::{
-    cancel, completions, config, convert, demo, doctor, help, info, jobs, logging, man, master,
-    read_dicom, render, rerender, status, tf, volumes, worker,
+    cancel, compare, completions, config, convert, demo, doctor, help, info, jobs, logging, man,
+    master, read_dicom, render, rerender, status, tf, volumes, worker,
 };
 use clap::{Arg, Command, CommandFactory, Parser, Subcommand};
 use std::fmt::Write;
@@ -39,6 +39,7 @@ pub(crate) struct Cli {
 #[derive(Subcommand, Debug)]
 pub(crate) enum Commands {
     Render(Box<render::RenderArgs>),
+    Compare(Box<compare::CompareArgs>),
     Rerender(rerender::RerenderArgs),
     Info(info::InfoArgs),
     Convert(convert::ConvertArgs),
@@ -67,7 +68,7 @@ pub(crate) enum Commands {
 
 /// Groups of the help and their commands, in its order.
 pub(crate) const GROUPS: [(&str, &[&str]); 4] = [
-    ("Pictures", &["render", "rerender", "info", "convert", "tf", "demo"]),
+    ("Pictures", &["render", "compare", "rerender", "info", "convert", "tf", "demo"]),
     ("Cluster", &["master", "worker", "status", "jobs", "cancel", "volumes", "put", "rm"]),
     ("Laboratory", &["lab"]),
     ("Setup", &["config", "doctor", "completions", "man", "help"]),

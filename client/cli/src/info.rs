@@ -1,5 +1,6 @@
 //! `slabcast info`: what is in a file, before anybody waits for a picture of it.
 
+use crate::orient;
 use glam::DVec3;
 use slabcast_common::brick::{BRICK_VOXELS, BrickGrid};
 use slabcast_common::quality::Compositing;
@@ -21,7 +22,8 @@ use std::path::PathBuf;
 #[command(after_help = "\
 Examples:
   slabcast info brain.nii.gz
-  slabcast info brain.nii.gz --json | jq .presets")]
+  slabcast info brain.nii.gz --json | jq .presets
+  slabcast info head.raw --orient          which way is up? all 24 in orient.png")]
 pub(crate) struct InfoArgs {
     #[arg(help = volume::VOLUME)]
     volume: PathBuf,
@@ -29,6 +31,12 @@ pub(crate) struct InfoArgs {
     axes: AxisArgs,
     #[command(flatten)]
     input: volume::InputArgs,
+    /// Draw all ways in which it may stand on one picture [default: orient.png]
+    ///
+    /// For files that do not say what is up: each of the 24 has the --up and --front that mean it.
+    #[arg(long, value_name = "FILE.png", num_args = 0..=1, require_equals = true,
+          default_missing_value = "orient.png", value_parser = slabcast_session::parse::png)]
+    orient: Option<PathBuf>,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -49,6 +57,20 @@ pub(crate) fn run(args: &InfoArgs) -> Result<(), Fail> {
     let volume = args.input.open(&args.volume)?;
     let orientation = args.axes.for_volume(&volume)?;
     let info = volume.info(volume.digest());
+    if let Some(path) = &args.orient {
+        if volume.anatomical {
+            return Err(Fail::usage(
+                "--orient: the file itself says what is up and in front; there is nothing to guess",
+            ));
+        }
+        if path.exists() {
+            return Err(Fail::failed(format!(
+                "{}: is there already; remove it, or give --orient=OTHER.png",
+                path.display()
+            )));
+        }
+        return orient::draw(&volume, &info, path);
+    }
     let shares = shares(&volume, &info)?;
     if args.json {
         return say(&format!("{:#}\n", json(&volume, &info, orientation, &shares)));
@@ -218,7 +240,7 @@ fn text(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
             format!("up {} ({}), front {} ({})", o.up, anatomy(o.up), o.front, anatomy(o.front))
         } else {
             format!(
-                "up {}, front {}; the file does not say what is up: see --up and --front",
+                "up {}, front {}; the file does not say what is up: see --orient, --up and --front",
                 o.up, o.front
             )
         },

@@ -14,7 +14,7 @@ use debug_views::DebugView;
 use quality::{choose_here, choose_there};
 use run::Run;
 use slabcast_client::{Client, VolumeDescription};
-use slabcast_common::volume::Volume;
+use slabcast_common::volume::{Digest32, Volume};
 use slabcast_scene::path::{MAX_FRAMES, Orientation};
 use slabcast_scene::request::VolumeChoice;
 use slabcast_session::embedded::{self, Cluster, WorkerGroup};
@@ -90,6 +90,9 @@ pub(crate) struct RenderArgs {
     threads: Option<u32>,
     #[command(flatten)]
     output: OutputArgs,
+    /// Fit --tf to this volume instead, for pictures to be compared
+    #[arg(long, value_name = "VOLUME", help_heading = "Picture", hide_short_help = true)]
+    like: Option<PathBuf>,
     /// Degrees of a turn, from its first frame on [default: 360]
     #[arg(long, value_name = "DEG", value_parser = slabcast_session::parse::number,
           allow_negative_numbers = true, help_heading = VIEW_PATH,
@@ -171,6 +174,17 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     }
     let crew = WorkerGroup::new(args.workers.unwrap_or(1), args.threads)?;
     let mut request = args.scene.request_with_turn(args.work.work()?, usual_turn(args)?)?;
+    let mut notes = Vec::new();
+    if let Some(like) = &args.like {
+        let other = volume::open(like)?.info(Digest32::default());
+        let fitted = request.transfer.fitted_to(&other).map_err(|e| request.blame(&e))?;
+        request.transfer = fitted;
+        notes.push(format!(
+            "--tf is fitted to {}; opacities are those of one of its samples' steps, {} long",
+            like.display(),
+            other.lattice.vox()
+        ));
+    }
     request.work.estimate = args.stats.is_some();
     request.hashed = args.stats.is_some() && !args.no_hash;
     if !request.target.is_empty() && args.show.is_some() {
@@ -207,7 +221,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         output,
         show: args.show,
         patience,
-        notes: stays.into_iter().collect(),
+        notes: notes.into_iter().chain(stays).collect(),
         tell: true,
     };
     let runtime = if master.is_none() { runtime::start_embedded()? } else { runtime::start()? };

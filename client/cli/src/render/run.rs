@@ -3,6 +3,7 @@
 use super::debug_views::{self, DebugView};
 use super::frame_check::FrameCheck;
 use super::trace::TraceFile;
+use slabcast_common::view::CameraProjection;
 use slabcast_common::volume::VolumeInfo;
 use slabcast_scene::path::{Orientation, ViewPath};
 use slabcast_scene::presets;
@@ -40,6 +41,30 @@ pub(super) struct Run {
     pub(super) began: Instant,
     /// Whether the run ends with a line that names the pictures.
     pub(super) tell: bool,
+}
+
+/// Fields of view from which on people lose sight of where the eye is: at 60 degrees it is 0.87 times
+/// the picture's height away from the target.
+const WIDE: f64 = 60.0;
+
+/// Says where the eye is if a wide field of view takes it near to the volume or into it.
+fn where_the_eye_is(path: &ViewPath, info: &VolumeInfo, o: Orientation) -> Option<String> {
+    let lattice = &info.lattice;
+    let camera = path.camera(0, lattice, o).ok()?;
+    let CameraProjection::Persp { fov, distance } = camera.projection else { return None };
+    let eye = camera.target + camera.to_eye.normalize() * distance;
+    let index = lattice.world_from_index().inverse() * eye + lattice.centre_index();
+    let inside = (0..3).all(|a| (-0.5..f64::from(lattice.dims[a]) - 0.5).contains(&index[a]));
+    let unit = if info.summary.anatomical { " mm" } else { "" };
+    let place = format!("--fov {fov}: the eye is {distance:.3}{unit} from the target");
+    if inside {
+        Some(format!(
+            "{place}, inside the volume: nothing behind it is drawn; give a smaller --fov or a larger \
+             --height to stand back"
+        ))
+    } else {
+        (fov > WIDE).then(|| format!("{place}; what is near it looks large"))
+    }
 }
 
 impl Run {
@@ -113,6 +138,12 @@ impl Run {
     ) -> Result<(), Fail> {
         let recipe = &recipe.clone().framed(source.framing.as_ref());
         let marker = self.marker(recipe.path().clone(), info, orientation)?;
+        if self.tell
+            && self.request.path_file.is_none()
+            && let Some(note) = where_the_eye_is(recipe.path(), info, orientation)
+        {
+            progress::note(&note);
+        }
         let Run {
             request,
             output,

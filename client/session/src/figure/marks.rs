@@ -357,7 +357,7 @@ mod tests {
             (r#""view":"posterior""#, "L R S I"),
             (r#""view":"left""#, "A P S I"),
             (r#""view":"superior""#, "L R A P"),
-            (r#""azimuth":45"#, "AR LP S I"),
+            (r#""azimuth":45"#, "RP LA S I"),
             (r#""azimuth":10"#, "R L S I"),
         ] {
             let path = ViewPath::from_json(&path(view)).unwrap();

@@ -1,38 +1,48 @@
-//! Several views side by side in one picture, each with its name.
+//! Several pictures side by side in one, each with its name.
 
-use super::contact::{Names, layout};
 use super::Frame;
+use super::contact::layout;
 use crate::figure::{Board, Marker, Place, text_size};
 use slabcast_common::image::PixelFormat;
 
-/// Frames as they come.
-pub(super) struct Grid {
-    names: Names,
-    /// Colour of cells without a view, sRGB.
+/// Frames as they come, all of one size and format.
+pub struct Grid {
+    /// Pictures beside each other; `None` for as many as make it about as wide as high.
+    columns: Option<usize>,
+    /// Colour of cells without a picture, sRGB.
     behind: [u8; 3],
-    frames: Vec<Frame>,
+    /// Pictures and their names.
+    frames: Vec<(Frame, String)>,
     /// What made the whole of it: comes with the first frame.
     provenance: String,
 }
 
 impl Grid {
-    pub(super) fn new(names: Names, behind: [u8; 3]) -> Grid {
-        Grid { names, behind, frames: Vec::new(), provenance: String::new() }
+    /// Returns an empty grid with so many pictures beside each other, on a background in sRGB.
+    pub fn new(columns: Option<usize>, behind: [u8; 3]) -> Grid {
+        Grid { columns, behind, frames: Vec::new(), provenance: String::new() }
     }
 
-    /// Takes a frame.
-    pub(super) fn add(&mut self, frame: Frame, provenance: String) {
+    /// Takes a picture of 8 bits.
+    pub fn add(&mut self, frame: Frame, name: &str) {
+        self.frames.push((frame, name.into()));
+    }
+
+    /// Takes what made the whole; empty text is none.
+    pub(super) fn made(&mut self, provenance: String) {
         if !provenance.is_empty() {
             self.provenance = provenance;
         }
-        self.frames.push(frame);
     }
 
-    /// The grid, with the marks of the whole, and what made it.
-    pub(super) fn draw(&mut self, marker: Option<&Marker>) -> (Frame, String) {
-        self.frames.sort_by_key(|frame| frame.number);
-        let Frame { number, size, format, .. } = self.frames[0];
-        let (columns, _) = layout(self.frames.len(), size);
+    /// Returns the grid, with the marks of the whole, and what made it.
+    ///
+    /// # Panics
+    /// There is no picture.
+    pub fn draw(&mut self, marker: Option<&Marker>) -> (Frame, String) {
+        self.frames.sort_by_key(|(frame, _)| frame.number);
+        let Frame { number, size, format, .. } = self.frames[0].0;
+        let columns = self.columns.unwrap_or_else(|| layout(self.frames.len(), size).0);
         let rows = self.frames.len().div_ceil(columns);
         let wide = if format == PixelFormat::Rgba8 { 4 } else { 3 };
         let [w, h] = size.map(|n| n as usize);
@@ -43,7 +53,7 @@ impl Grid {
         let [r, g, b] = self.behind;
         let pixel = if wide == 4 { vec![0; 4] } else { vec![r, g, b] };
         let mut bytes = pixel.repeat(whole[0] * whole[1]);
-        for (i, frame) in self.frames.iter().enumerate() {
+        for (i, (frame, _)) in self.frames.iter().enumerate() {
             let (x, y) = (i % columns * w, i / columns * h);
             for (row, line) in frame.bytes.chunks_exact(w * wide).enumerate() {
                 bytes[((y + row) * whole[0] + x) * wide..][..w * wide].copy_from_slice(line);
@@ -52,10 +62,10 @@ impl Grid {
         let behind = if wide == 4 { [255; 3] } else { self.behind };
         let whole = whole.map(|n| n as u32);
         let mut board = Board::new(whole, format, bytes, behind).with_text_of(size);
-        for (i, frame) in self.frames.iter().enumerate() {
+        for (i, (_, name)) in self.frames.iter().enumerate() {
             let (x, y) = ((i % columns * w) as f64, (i / columns * h) as f64);
             let cell = [x, y, x + w as f64, y + h as f64];
-            board.name(cell, self.names.get(frame.number).unwrap_or_default(), Place::TopLeft);
+            board.name(cell, name, Place::TopLeft);
         }
         if let Some(marker) = marker {
             marker.draw_whole(&mut board, cells.map(|n| n as f64));

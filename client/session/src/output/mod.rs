@@ -22,6 +22,7 @@ mod y4m;
 
 pub use file::{DiskWait, probe, write_atomic};
 pub use format::{Format, named};
+pub use grid::Grid;
 pub use lines::Lines;
 pub use made::OutputFolder;
 
@@ -32,7 +33,6 @@ use crate::parse;
 use crate::request::RenderRequest;
 use contact::{Contact, Names};
 use folder::{Folder, Wanted};
-use grid::Grid;
 use movie::{Movie, Sink};
 use provenance::Provenance;
 use slabcast_common::image::{Background, Picture, PixelFormat};
@@ -473,7 +473,7 @@ impl Writer {
             .as_ref()
             .map(|_| Arc::new(Mutex::new(Contact::new(frames, output.names.clone()))));
         let is_grid = matches!(output.target, Target::Grid(_));
-        let grid = is_grid.then(|| Arc::new(Mutex::new(Grid::new(output.names.clone(), behind))));
+        let grid = is_grid.then(|| Arc::new(Mutex::new(Grid::new(None, behind))));
         let (busy, written) = (JoinSet::new(), Vec::new());
         let marker = marker.map(Arc::new);
         Ok(Writer { output, marker, movie, grid, contact, patience, busy, written })
@@ -520,7 +520,9 @@ impl Writer {
                 }
                 (_, _, Some(grid)) => {
                     let number = frame.number;
-                    grid.lock().expect("no thread panics with it").add(frame, provenance);
+                    let mut grid = grid.lock().expect("no thread panics with it");
+                    grid.made(provenance);
+                    grid.add(frame, output.names.get(number).unwrap_or_default());
                     return Ok(number);
                 }
                 _ => unreachable!("made with the writer"),
@@ -607,6 +609,24 @@ impl Writer {
         self.written.sort_unstable();
         &self.written
     }
+}
+
+/// Writes one picture that has no provenance: whole or not there.
+///
+/// # Errors
+/// The file can't be written.
+pub fn write_picture(
+    path: &Path,
+    frame: &Frame,
+    dpi: Option<u32>,
+    format: Format,
+) -> Result<(), Fail> {
+    write(path, frame, &Inside { provenance: "", dpi }, format, &DiskWait::default())
+}
+
+/// Returns a background as sRGB bytes; black where there is none.
+pub fn background_bytes(background: Background) -> [u8; 3] {
+    ffmpeg::bytes_of(background)
 }
 
 /// Writes one picture: whole or not there.

@@ -7,9 +7,9 @@ use crate::software::SOFTWARE;
 use slabcast_common::image::PixelFormat;
 use std::io::{Cursor, Error, Result, Write};
 use tiff::TiffError;
-use tiff::encoder::colortype::{ColorType, RGB8};
+use tiff::encoder::colortype::{ColorType, RGB8, RGBA8};
 use tiff::encoder::{Compression, Predictor, Rational, TiffEncoder};
-use tiff::tags::{ExtraSamples, ResolutionUnit, Tag};
+use tiff::tags::{ResolutionUnit, Tag};
 
 /// Encodes a frame of 8 bits as a TIFF.
 ///
@@ -22,7 +22,12 @@ pub(super) fn encode(frame: &Frame, inside: &Inside<'_>, out: &mut impl Write) -
         _ => return Err(Error::other("a TIFF takes 8 bits")),
     };
     let mut bytes = Cursor::new(Vec::new());
-    write::<RGB8>(frame, alpha, inside, &mut bytes).map_err(|e| match e {
+    let written = if alpha {
+        write::<RGBA8>(frame, inside, &mut bytes)
+    } else {
+        write::<RGB8>(frame, inside, &mut bytes)
+    };
+    written.map_err(|e| match e {
         TiffError::IoError(e) => e,
         other => Error::other(other),
     })?;
@@ -31,7 +36,6 @@ pub(super) fn encode(frame: &Frame, inside: &Inside<'_>, out: &mut impl Write) -
 
 fn write<C: ColorType<Inner = u8>>(
     frame: &Frame,
-    alpha: bool,
     inside: &Inside<'_>,
     out: &mut Cursor<Vec<u8>>,
 ) -> std::result::Result<(), TiffError> {
@@ -39,8 +43,9 @@ fn write<C: ColorType<Inner = u8>>(
     let mut tiff =
         TiffEncoder::new(out)?.with_compression(Compression::Lzw).with_predictor(Predictor::Horizontal);
     let mut image = tiff.new_image::<C>(w, h)?;
-    if alpha {
-        image.extra_samples(&[ExtraSamples::UnassociatedAlpha])?;
+    if C::BITS_PER_SAMPLE.len() == 4 {
+        // Alpha, and colours that aren't multiplied by it.
+        image.encoder().write_tag(Tag::ExtraSamples, &[2u16][..])?;
     }
     if let Some(dpi) = inside.dpi {
         image.resolution(ResolutionUnit::Inch, Rational { n: dpi, d: 1 });

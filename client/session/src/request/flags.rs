@@ -7,7 +7,7 @@ use super::{KeepArgs, RenderRequest};
 use crate::fail::Fail;
 use crate::parse::{self, Frames, Tile};
 use crate::quality_target::QualityTarget;
-use crate::transfer::{Transfer, TransferFlags, read_json};
+use crate::transfer::{NameOrFile, Transfer, TransferFlags, read_json};
 use crate::volume::InputArgs;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser, ValueParser};
 use slabcast_common::image::Background;
@@ -210,7 +210,8 @@ pub struct PictureArgs {
     /// A preset (auto, skin, bone, vessels, ...), a colour map (viridis, ...) or a JSON file, ours
     /// or ParaView's. `slabcast tf --list` has all names, `slabcast info VOLUME` shows what each
     /// preset would draw.
-    #[arg(long, value_name = "NAME|FILE", default_value = "auto")]
+    #[arg(long, value_name = "NAME|FILE", default_value = "auto", hide_possible_values = true,
+          value_parser = NameOrFile::TRANSFER)]
     tf: String,
     #[command(flatten)]
     transfer: TransferFlags,

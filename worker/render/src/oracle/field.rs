@@ -68,13 +68,18 @@ pub(super) fn render<S: FieldSum>(
                 let row = weighted::<S>(section, wy);
                 let along = frame.along_row(at, y);
                 let (x0, wx) = S::window(&footprint, 0, along, (0, w as i32), &mut bx);
+                // Nobody reads sums of shut pixels; whoever counts does so for people who wait.
+                let run = Rect::new(x0, y, x0 + wx.len() as i32, y + 1);
+                if counters.as_ref().is_some_and(|counters| counters.all_shut(run)) {
+                    continue;
+                }
                 for (x, &wx) in (x0..).zip(wx) {
                     let term = weighted::<S>(row, wx);
                     let pixel = &mut here[y as usize * w + x as usize];
                     *pixel = std::array::from_fn(|c| pixel[c].with(term[c]));
                 }
                 if let Some(counters) = counters.as_mut() {
-                    counters.add_section(Rect::new(x0, y, x0 + wx.len() as i32, y + 1));
+                    counters.add_section(run);
                 }
             }
         }

@@ -41,6 +41,14 @@ pub fn count_work(frame: &Frame, bricks: &[Arc<Brick>]) -> (Picture, WorkCounter
 }
 
 impl WorkCounters {
+    /// Returns whether all pixels of `rect` were shut.
+    pub(crate) fn all_shut(&self, rect: Rect) -> bool {
+        (rect.y0 as usize..rect.y1 as usize).all(|y| {
+            let row = &self.shut_in[y * self.width..][rect.x0 as usize..rect.x1 as usize];
+            row.iter().all(Option::is_some)
+        })
+    }
+
     /// Counts a section that was added to the pixels of `rect`.
     pub(crate) fn add_section(&mut self, rect: Rect) {
         for y in rect.y0 as usize..rect.y1 as usize {

@@ -157,8 +157,7 @@ fn halves(args: &CompareArgs, mut request: RenderRequest) -> Result<[Half; 2], F
         let name = if stem(file) == stem(other) { file.display().to_string() } else { stem(file) };
         let (volume, own) = (Arc::new(volume), request.clone());
         if both.is_empty() {
-            request.transfer =
-                request.transfer.fitted_to(&info).map_err(|e| request.blame(&e))?;
+            request.transfer = request.transfer.fitted_to(&info).map_err(|e| request.blame(&e))?;
         }
         both.push(Half { name, volume, info, orientation, request: own, transfer });
     }
@@ -187,11 +186,8 @@ fn frame(halves: &mut [Half; 2]) -> Result<(), Fail> {
         found.push(one.map_err(|e| request.blame(&e))?.unwrap_or(usual));
     }
     let placed = halves.iter().all(|half| half.volume.anatomical);
-    let apart = (0..3)
-        .map(|a| found[0].target[a] - found[1].target[a])
-        .map(|d| d * d)
-        .sum::<f64>()
-        .sqrt();
+    let apart =
+        (0..3).map(|a| found[0].target[a] - found[1].target[a]).map(|d| d * d).sum::<f64>().sqrt();
     let height = found[0].height.max(found[1].height);
     let shared = placed && apart < 0.5 * height;
     let middle = std::array::from_fn(|a| (found[0].target[a] + found[1].target[a]) / 2.0);

@@ -71,7 +71,8 @@ pub(crate) fn draw(volume: &Volume, info: &VolumeInfo, path: &Path) -> Result<()
     let stage = PathScenes::new(volume, info, &request, usual)?;
     let mut grid = Grid::new(Some(4), [0; 3]);
     for (i, o) in guesses.iter().enumerate() {
-        let picture = direct::draw(&stage.frame(i)?, &stage.bricks, Cut::on(machine::cores() as usize));
+        let picture =
+            direct::draw(&stage.frame(i)?, &stage.bricks, Cut::on(machine::cores() as usize));
         let bytes = picture.encode(PixelFormat::Rgb8, Background::Colour([0.0; 3])).into();
         let frame = Frame { number: i as u64, size, format: PixelFormat::Rgb8, bytes };
         grid.add(frame, &format!("--up={} --front={}", o.up, o.front));

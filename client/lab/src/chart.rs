@@ -4,7 +4,6 @@
 //! ([`slabcast_session::letters`]). One drawing function serves both; [`Sheet`] hides the writer and the size
 //! of a pixel. Text is measured in the same font, so that labels never overlap.
 
-
 use plotters::coord::Shift;
 use plotters::prelude::*;
 use slabcast_session::fail::Fail;

@@ -134,7 +134,10 @@ mod tests {
 
     #[test]
     fn letters_of_europe_are_there_and_others_are_named() {
-        assert_eq!(missing("T1, 5 \u{b5}m, \u{3b1}, \u{c5}\u{142}\u{f6}\u{17e}, \u{416}\u{444}"), None);
+        assert_eq!(
+            missing("T1, 5 \u{b5}m, \u{3b1}, \u{c5}\u{142}\u{f6}\u{17e}, \u{416}\u{444}"),
+            None
+        );
         assert_eq!(missing("a \u{6f22}b"), Some('\u{6f22}'));
     }
 

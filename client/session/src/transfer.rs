@@ -376,10 +376,16 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let formulas = ["spheres:24", "ramp:16", "blob:24", "fog:16", "marker:24", "one", "full:8"];
         for name in formulas {
-            round_trip(&crate::volume::open(format!("formula:{name}").as_ref()).unwrap(), dir.path());
+            round_trip(
+                &crate::volume::open(format!("formula:{name}").as_ref()).unwrap(),
+                dir.path(),
+            );
         }
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
-        round_trip(&crate::volume::open(&root.join("samples/mni152_t1.nii.gz")).unwrap(), dir.path());
+        round_trip(
+            &crate::volume::open(&root.join("samples/mni152_t1.nii.gz")).unwrap(),
+            dir.path(),
+        );
         for name in ["tooth.nrrd", "lidc2.nrrd", "heptane.nrrd", "stent.nrrd"] {
             let file = root.join("../shared/data").join(name);
             if !file.exists() {

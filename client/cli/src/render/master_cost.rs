@@ -106,8 +106,8 @@ async fn plain(
         }
         let _ = to.blocking_send(Ok(Update::Done));
     });
-    let done =
-        run.go(Source { updates, cancel: Cancel::none(), framing: None }, "", &info, &recipe).await;
+    let source = Source { updates, cancel: Cancel::none(), framing: None };
+    let done = run.go(source, "", (&info, orientation), &recipe).await;
     for thread in [draw, encode] {
         thread.join().expect("a thread that draws or encodes");
     }

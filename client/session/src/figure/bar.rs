@@ -11,8 +11,12 @@ pub(super) fn round_below(most: f64) -> f64 {
 pub(super) fn number(x: f64) -> String {
     let short = format!("{x:.3e}").parse::<f64>().unwrap_or(x);
     let size = short.abs();
-    if short == 0.0 || (1e-4..1e6).contains(&size) { format!("{short}") } else { format!("{short:e}") }
-        .replace('-', "\u{2212}")
+    if short == 0.0 || (1e-4..1e6).contains(&size) {
+        format!("{short}")
+    } else {
+        format!("{short:e}")
+    }
+    .replace('-', "\u{2212}")
 }
 
 /// A length in mm in the prefix that suits it.
@@ -48,7 +52,8 @@ mod tests {
 
     #[test]
     fn bars_are_round() {
-        for (most, want) in [(1.0, 1.0), (99.0, 50.0), (100.0, 100.0), (0.37, 0.2), (4.9e-5, 2e-5)] {
+        for (most, want) in [(1.0, 1.0), (99.0, 50.0), (100.0, 100.0), (0.37, 0.2), (4.9e-5, 2e-5)]
+        {
             assert!((round_below(most) / want - 1.0).abs() < 1e-12, "{most}");
         }
         for (mm, want) in [

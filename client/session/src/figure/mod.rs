@@ -113,9 +113,12 @@ mod tests {
     fn captions_that_cannot_be_drawn_are_refused_by_name() {
         let of = |caption: &str| Figure { caption: Some(caption.into()), ..Figure::default() };
         assert!(of("Fig. 1: left hippocampus, 3 \u{b5}m").check(false, true).is_ok());
-        for (caption, says) in
-            [("", "empty"), ("\u{6f22}", "no letter"), ("a\nb", "no letter"), (&"x".repeat(500), "too many")]
-        {
+        for (caption, says) in [
+            ("", "empty"),
+            ("\u{6f22}", "no letter"),
+            ("a\nb", "no letter"),
+            (&"x".repeat(500), "too many"),
+        ] {
             let said = of(caption).check(false, true).unwrap_err();
             let said = said.line().unwrap_or_default().to_string();
             assert!(said.starts_with("--caption: ") && said.contains(says), "{caption}: {said}");

@@ -50,8 +50,20 @@ fn coding(format: Format, behind: [u8; 3]) -> Vec<String> {
     let even = format!("{TAGS},pad=ceil(iw/2)*2:ceil(ih/2)*2:color=0x{r:02x}{g:02x}{b:02x}");
     let words: &[&str] = match format {
         Format::Webm => &[
-            "-vf", &even, "-pix_fmt", "yuv420p", "-c:v", "libvpx-vp9", "-crf", "24", "-b:v", "0",
-            "-row-mt", "1", "-f", "webm",
+            "-vf",
+            &even,
+            "-pix_fmt",
+            "yuv420p",
+            "-c:v",
+            "libvpx-vp9",
+            "-crf",
+            "24",
+            "-b:v",
+            "0",
+            "-row-mt",
+            "1",
+            "-f",
+            "webm",
         ],
         Format::Gif => {
             let palette = "split[a][b];[a]palettegen[p];[b][p]paletteuse=dither=sierra2_4a";
@@ -59,8 +71,18 @@ fn coding(format: Format, behind: [u8; 3]) -> Vec<String> {
             return ["-vf", &filter, "-loop", "0", "-f", "gif"].map(String::from).into();
         }
         _ => &[
-            "-vf", &even, "-pix_fmt", "yuv420p", "-c:v", "libx264", "-crf", "17", "-movflags",
-            "+faststart", "-f", "mp4",
+            "-vf",
+            &even,
+            "-pix_fmt",
+            "yuv420p",
+            "-c:v",
+            "libx264",
+            "-crf",
+            "17",
+            "-movflags",
+            "+faststart",
+            "-f",
+            "mp4",
         ],
     };
     words.iter().map(|&word| word.into()).collect()

@@ -265,8 +265,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let own = dir.path().join("out/");
         let look = |part, force| {
-            let (folder, note) =
-                Folder::look_for_own(&own, &wanted(0..3, part), force).unwrap();
+            let (folder, note) = Folder::look_for_own(&own, &wanted(0..3, part), force).unwrap();
             (folder.path.file_name().unwrap().to_str().unwrap().to_string(), note)
         };
         assert_eq!(look(false, false), ("out".into(), None));
@@ -277,7 +276,10 @@ mod tests {
         fill(&own, &[5]);
         let (name, note) = look(false, false);
         let note = note.unwrap();
-        assert!(name == "out-2" && note.contains("out/ holds") && note.contains("out-2/"), "{note}");
+        assert!(
+            name == "out-2" && note.contains("out/ holds") && note.contains("out-2/"),
+            "{note}"
+        );
         // Other frames of the same path go beside those that are there.
         assert_eq!(look(true, false).0, "out");
         assert_eq!(look(false, true).0, "out");

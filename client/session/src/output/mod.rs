@@ -235,11 +235,9 @@ fn fits_background(format: Format, background: Background) -> Result<(), Fail> {
         (Format::Jpg, Background::Transparent) => Err(Fail::usage(
             "--background: a JPEG has no transparency; give a colour, or a name that ends in .png",
         )),
-        (format, Background::Transparent) if format.moves() && format != Format::Apng => {
-            Err(Fail::usage(
-                "--background: video has no transparency; give a colour, or --format apng",
-            ))
-        }
+        (format, Background::Transparent) if format.moves() && format != Format::Apng => Err(
+            Fail::usage("--background: video has no transparency; give a colour, or --format apng"),
+        ),
         (Format::Exr, Background::Colour(c)) if c != [0.0; 3] => Err(Fail::usage(
             "--background: an EXR holds the picture before any background; leave it out",
         )),
@@ -498,8 +496,9 @@ impl Writer {
         self.busy.spawn_blocking(move || {
             let mut frame = output.full(frame);
             if let Some(marker) = marker {
-                frame.bytes =
-                    marker.draw(frame.number, frame.size, frame.format, frame.bytes.to_vec()).into();
+                frame.bytes = marker
+                    .draw(frame.number, frame.size, frame.format, frame.bytes.to_vec())
+                    .into();
             }
             let provenance = made.map_or_else(String::new, |made| made.written(&frame));
             if let Some(contact) = contact {

@@ -40,8 +40,9 @@ fn write<C: ColorType<Inner = u8>>(
     out: &mut Cursor<Vec<u8>>,
 ) -> std::result::Result<(), TiffError> {
     let [w, h] = frame.size;
-    let mut tiff =
-        TiffEncoder::new(out)?.with_compression(Compression::Lzw).with_predictor(Predictor::Horizontal);
+    let mut tiff = TiffEncoder::new(out)?
+        .with_compression(Compression::Lzw)
+        .with_predictor(Predictor::Horizontal);
     let mut image = tiff.new_image::<C>(w, h)?;
     if C::BITS_PER_SAMPLE.len() == 4 {
         // Alpha, and colours that aren't multiplied by it.

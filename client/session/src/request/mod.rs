@@ -8,8 +8,8 @@ mod flags;
 mod keep;
 
 pub use flags::{
-    AxisArgs, OpenedVolume, PictureArgs, QualityArgs, SceneArgs, ThreadArgs, UsualTurn,
-    ViewArgs, VolumeSceneArgs, WorkArgs,
+    AxisArgs, OpenedVolume, PictureArgs, QualityArgs, SceneArgs, ThreadArgs, UsualTurn, ViewArgs,
+    VolumeSceneArgs, WorkArgs,
 };
 pub use keep::KeepArgs;
 
@@ -154,9 +154,13 @@ impl RenderRequest {
         let spacing = info.lattice.spacing();
         let small = spacing.into_iter().fold(f64::INFINITY, f64::min);
         let large = spacing.into_iter().fold(0.0, f64::max);
-        let given = self.path.turntable.is_none_or(|t| t.height.or(t.target.map(|_| 0.0)).is_some())
-            && !self.path.wants_framing();
-        if large < 1000.0 * small || given || !["target", "eye", "height"].contains(&&*refused.field) {
+        let given =
+            self.path.turntable.is_none_or(|t| t.height.or(t.target.map(|_| 0.0)).is_some())
+                && !self.path.wants_framing();
+        if large < 1000.0 * small
+            || given
+            || !["target", "eye", "height"].contains(&&*refused.field)
+        {
             return None;
         }
         Some(Fail::failed(format!(

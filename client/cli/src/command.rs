@@ -112,7 +112,8 @@ fn find<'a>(command: &'a Command, name: &str) -> &'a Command {
 fn short_help(command: &Command) -> String {
     let mut text = String::new();
     for (group, names) in GROUPS {
-        for (n, name) in names.iter().enumerate() {
+        // The last line says what `help` does.
+        for (n, name) in names.iter().filter(|name| **name != "help").enumerate() {
             let group = if n == 0 { group } else { "" };
             // Writing to a string does not fail.
             let _ = writeln!(text, "{group:<11} {name:<12} {}", about(find(command, name)));

@@ -283,8 +283,11 @@ fn a_real_video_has_the_colours_of_the_pictures() {
         eprintln!("skipped: there is no ffmpeg");
         return;
     }
+    let draw = |size: &str, to: &str| {
+        good(dir, &["render", "formula:spheres:24", "--size", size, "--frames", "3", "-o", to]);
+    };
     for name in ["turn.mp4", "turn.webm", "turn.gif"] {
-        render(dir, &["--frames", "3", "--size", "65x49", "-o", name]);
+        draw("65x49", name);
         let probe =
             std::process::Command::new("ffmpeg").args(["-i", name]).current_dir(dir).output();
         let said = text(&probe.unwrap().stderr);
@@ -295,8 +298,8 @@ fn a_real_video_has_the_colours_of_the_pictures() {
             assert!(said.contains("66x50"), "{said}");
         }
     }
-    render(dir, &["--frames", "3", "--size", "64x48", "-o", "even.mp4"]);
-    render(dir, &["--frames", "3", "--size", "64x48", "-o", "still"]);
+    draw("64x48", "even.mp4");
+    draw("64x48", "still");
     let line = ["-i", "even.mp4", "-frames:v", "1", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"];
     let out = std::process::Command::new("ffmpeg").args(line).current_dir(dir).output().unwrap();
     let (_, want) = pixels(&dir.join("still/frame_0000.png"));

@@ -141,6 +141,7 @@ fn world() -> tempfile::TempDir {
     put("short.nrrd", &nrrd(16)[..2000]);
     put("empty.nrrd", b"");
     put("text.txt", b"hello\n");
+    put("text", b"hello\n");
     let packed = gzip(&nifti(24));
     put("cut.nii.gz", &packed[..packed.len() / 2]);
     put(
@@ -270,7 +271,7 @@ fn files() -> Vec<(&'static [&'static str], &'static [&'static str])> {
         (&["tf", "bone", "-o", "big.json"], &["big.json", "--force"]),
         (&["tf", "missing.json"], &["missing.json"]),
         (&["render", "good.nrrd", "-o", "full"], &["full", "frame_0000.png", "--force"]),
-        (&["render", "good.nrrd", "-o", "text.txt"], &["text.txt", "-o"]),
+        (&["render", "good.nrrd", "-o", "text"], &["text", "-o"]),
         (&["render", "good.nrrd", "-o", "/proc/slabcast/out"], &["/proc/slabcast"]),
         (&["render", "good.nrrd", "--stats", "nowhere/s.jsonl"], &["nowhere/s.jsonl"]),
         (&["render", "good.nrrd", "--trace", "full"], &["full"]),
@@ -497,7 +498,7 @@ const OTHERS: &[(i32, &[&str], &[&str])] = &[
     (2, &["config", "show", "check"], &["check", "render"]),
     (2, &["config", "show", "render", "--sise", "3x3"], &["--sise", "--size"]),
     (2, &["doctor", "--master", "nowhere:"], &["--master", "HOST:PORT"]),
-    (1, &["demo", "-o", "text.txt"], &["text.txt", "-o"]),
+    (1, &["demo", "-o", "text"], &["text", "-o"]),
     (2, &["completions", "tcsh"], &["tcsh", "bash"]),
     (1, &["man", "text.txt"], &["text.txt"]),
 ];
@@ -604,7 +605,10 @@ fn existing_frames_are_not_replaced_without_force() {
     let out = run(dir.path(), &args);
     let stderr = String::from_utf8_lossy(&out.stderr);
     assert!(out.status.success(), "{stderr}");
-    assert!(stderr.contains("frame_0003.png of an earlier run stays"), "{stderr}");
+    assert!(
+        stderr.contains("frame_0003.png of an earlier run, not written by slabcast, stays"),
+        "{stderr}"
+    );
     let png = std::fs::read(dir.path().join("full/frame_0000.png")).unwrap();
     assert!(png.starts_with(b"\x89PNG"));
     let names = tree(&dir.path().join("full"));

@@ -286,6 +286,10 @@ fn a_real_video_has_the_colours_of_the_pictures() {
     let draw = |size: &str, to: &str| {
         good(dir, &["render", "formula:spheres:24", "--size", size, "--frames", "3", "-o", to]);
     };
+    let line =
+        ["render", "formula:spheres:24", "--size", "65x49", "--frames", "2", "-o", "odd.mp4"];
+    let said = text(&run(dir, &line).stderr);
+    assert!(said.contains("note: odd.mp4: video has even edges: 65x49 becomes 66x50"), "{said}");
     for name in ["turn.mp4", "turn.webm", "turn.gif"] {
         draw("65x49", name);
         let probe =

@@ -229,6 +229,18 @@ fn is_pipe(path: &Path) -> bool {
     std::fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir())
 }
 
+/// Says what becomes of odd edges in a format that has none.
+fn evened(format: Format, [w, h]: [u32; 2]) -> Option<String> {
+    let even = [w, h].map(|n| n.next_multiple_of(2));
+    let odd = matches!(format, Format::Mp4 | Format::Webm) && even != [w, h];
+    odd.then(|| {
+        format!(
+            "video has even edges: {w}x{h} becomes {}x{}, by a line of the background",
+            even[0], even[1]
+        )
+    })
+}
+
 /// Checks that a format can have a background, and the other way round.
 fn fits_background(format: Format, background: Background) -> Result<(), Fail> {
     match (format, background) {
@@ -304,6 +316,7 @@ impl Output {
                 )));
             }
             may_write(path, "output", inputs, args.force)?;
+            stays = evened(format, request.size()).map(|note| format!("{shown}: {note}"));
             Target::Movie(path.to_path_buf())
         } else if named.is_some() {
             let grid = count > 1 && names.all_of(&frames);

@@ -356,6 +356,7 @@ pub fn read_json(path: &Path) -> Result<String, Fail> {
 mod tests {
     use super::*;
     use slabcast_common::volume::{Digest32, Volume};
+    use std::io::Write;
 
     fn round_trip(volume: &Volume, dir: &Path) {
         let info = volume.info(Digest32::default());
@@ -386,10 +387,11 @@ mod tests {
             &crate::volume::open(&root.join("samples/mni152_t1.nii.gz")).unwrap(),
             dir.path(),
         );
-        for name in ["tooth.nrrd", "lidc2.nrrd", "heptane.nrrd", "stent.nrrd"] {
+        for name in ["tooth.nrrd", "lidc2.nrrd", "heptane.nrrd", "chris_t1.nrrd"] {
             let file = root.join("../shared/data").join(name);
             if !file.exists() {
-                eprintln!("skipped: {} is missing", file.display());
+                // A direct write: the test harness captures only what the macros print.
+                let _ = writeln!(std::io::stderr(), "skipped: needs shared/data ({name})");
                 continue;
             }
             round_trip(&crate::volume::open(&file).unwrap(), dir.path());

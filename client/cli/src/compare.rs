@@ -46,7 +46,7 @@ pub(crate) struct CompareArgs {
     scene: SceneArgs,
     #[command(flatten)]
     threads: ThreadArgs,
-    /// Picture to write: png, tif or jpg [default: compare.png]
+    /// Picture to write: png, tif or jpg [default: compare.png, then compare-2.png]
     #[arg(short, long, value_name = "FILE", help_heading = "Output")]
     output: Option<PathBuf>,
     /// Replace a file that is there already
@@ -68,7 +68,9 @@ struct Half {
 
 /// Runs the command.
 pub(crate) fn run(args: &CompareArgs) -> Result<(), Fail> {
-    let path = args.output.clone().unwrap_or_else(|| "compare.png".into());
+    let own = PathBuf::from("compare.png");
+    let own = || if args.force { own.clone() } else { output::free_name(&own) };
+    let path = args.output.clone().unwrap_or_else(own);
     let format = match output::named(&path)? {
         Some(format @ (Format::Png | Format::Tif | Format::Jpg)) => format,
         _ => {

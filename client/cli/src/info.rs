@@ -9,6 +9,7 @@ use slabcast_common::volume::{Lattice, Samples, ValueSummary, Volume, VolumeInfo
 use slabcast_scene::path::Orientation;
 use slabcast_scene::presets::{self, Levels};
 use slabcast_session::fail::{Fail, say};
+use slabcast_session::output::free_name;
 use slabcast_session::progress::bytes;
 use slabcast_session::request::AxisArgs;
 use slabcast_session::volume;
@@ -35,11 +36,16 @@ pub(crate) struct InfoArgs {
     ///
     /// For files that do not say what is up: each of the 24 has the --up and --front that mean it.
     #[arg(long, value_name = "FILE.png", num_args = 0..=1, require_equals = true,
-          default_missing_value = "orient.png", value_parser = slabcast_session::parse::png)]
+          default_missing_value = "", value_parser = orient_file)]
     orient: Option<PathBuf>,
     /// As JSON
     #[arg(long)]
     json: bool,
+}
+
+/// Parses the file of `--orient`; empty is the usual one.
+fn orient_file(text: &str) -> Result<PathBuf, String> {
+    if text.is_empty() { Ok(PathBuf::new()) } else { slabcast_session::parse::png(text) }
 }
 
 /// Share of the volume that a preset draws.
@@ -63,6 +69,8 @@ pub(crate) fn run(args: &InfoArgs) -> Result<(), Fail> {
                 "--orient: the file itself says what is up and in front; there is nothing to guess",
             ));
         }
+        let own = path.as_os_str().is_empty();
+        let path = &if own { free_name("orient.png".as_ref()) } else { path.clone() };
         if path.exists() {
             return Err(Fail::failed(format!(
                 "{}: is there already; remove it, or give --orient=OTHER.png",

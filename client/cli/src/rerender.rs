@@ -3,7 +3,7 @@
 use crate::render;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::output::provenance::{self, Provenance};
-use slabcast_session::output::{Output, OutputArgs};
+use slabcast_session::output::{Output, OutputArgs, free_name};
 use slabcast_session::{progress, volume};
 use std::path::PathBuf;
 
@@ -29,7 +29,7 @@ pub(crate) struct RerenderArgs {
     volume: Option<PathBuf>,
     #[command(flatten)]
     input: volume::InputArgs,
-    /// File for the new picture [default: again.png, with the ending of PICTURE]
+    /// File for the new picture [default: again.png, then again-2.png, with the ending of PICTURE]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Replace a file that is there already
@@ -52,8 +52,9 @@ pub(crate) fn run(args: &RerenderArgs) -> Result<(), Fail> {
         return say(&(json + "\n"));
     };
     let ending = args.picture.extension().unwrap_or_default();
-    let target =
-        args.output.clone().unwrap_or_else(|| PathBuf::from("again").with_extension(ending));
+    let own = PathBuf::from("again").with_extension(ending);
+    let own = || if args.force { own.clone() } else { free_name(&own) };
+    let target = args.output.clone().unwrap_or_else(own);
     let request = made.request();
     let output = OutputArgs {
         output: Some(target.clone()),

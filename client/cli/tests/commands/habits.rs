@@ -146,7 +146,8 @@ fn two_volumes_stand_side_by_side_under_one_look() {
     assert!(said.contains("compare.png"), "{said}");
     let (size, _) = pixels(&dir.join("compare.png"));
     assert!(size[0] > 120 && size[1] == 40, "{size:?}");
-    let out = run(dir, &pair);
+    assert!(good(dir, &pair).contains("compare-2.png"));
+    let out = run(dir, &[&pair[..], &["-o", "compare.png"]].concat());
     assert!(text(&out.stderr).contains("--force") && out.status.code() == Some(1));
     // The first is the picture that render draws, framed by the larger of both.
     good(
@@ -195,7 +196,9 @@ fn a_volume_that_stands_somehow_is_guessed() {
     good(dir, &["info", "formula:spheres:24", "--orient"]);
     let (size, _) = pixels(&dir.join("orient.png"));
     assert_eq!(size, [4 * 192, 6 * 192]);
-    let out = run(dir, &["info", "formula:spheres:24", "--orient"]);
+    good(dir, &["info", "formula:spheres:24", "--orient"]);
+    assert_eq!(names(dir), ["orient-2.png", "orient.png"]);
+    let out = run(dir, &["info", "formula:spheres:24", "--orient=orient.png"]);
     assert!(out.status.code() == Some(1) && text(&out.stderr).contains("is there already"));
 }
 

@@ -3,7 +3,7 @@
 use crate::fail::Fail;
 use serde::{Deserialize, Serialize};
 use slabcast_common::image::{Background, PixelFormat};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// File format in which frames are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -145,6 +145,16 @@ pub fn named(path: &Path) -> Result<Option<Format>, Fail> {
     Ok(format)
 }
 
+/// Returns a file's name if nothing has it, else the first free one of `NAME-2.png`, `NAME-3.png` and
+/// so on: for files that the user did not name.
+pub fn free_name(path: &Path) -> PathBuf {
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    let ending = path.extension().unwrap_or_default();
+    let beside = |n: u32| path.with_file_name(format!("{stem}-{n}")).with_extension(ending);
+    let names = std::iter::once(path.to_path_buf()).chain((2..10_000).map(beside));
+    names.into_iter().find(|name| !name.exists()).unwrap_or_else(|| path.to_path_buf())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -168,6 +178,16 @@ mod tests {
             let said = said.line().unwrap_or_default();
             assert!(said.contains(name) && said.contains(".png, .tif"), "{name}: {said}");
         }
+    }
+
+    #[test]
+    fn a_file_that_nobody_named_goes_beside_another() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("compare.png");
+        assert_eq!(free_name(&file), file);
+        std::fs::write(&file, "").unwrap();
+        std::fs::write(dir.path().join("compare-2.png"), "").unwrap();
+        assert_eq!(free_name(&file), dir.path().join("compare-3.png"));
     }
 
     #[test]

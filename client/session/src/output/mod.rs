@@ -21,7 +21,7 @@ mod tif;
 mod y4m;
 
 pub use file::{DiskWait, probe, write_atomic};
-pub use format::{Format, named};
+pub use format::{Format, free_name, named};
 pub use grid::Grid;
 pub use lines::Lines;
 pub use made::OutputFolder;

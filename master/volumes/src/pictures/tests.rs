@@ -166,3 +166,17 @@ fn stack_of_unequal_or_broken_pictures_is_refused_by_name() {
     let e = open(&[("a.jpg", whole[..whole.len() - 5].to_vec())]).unwrap_err();
     assert!(e.contains("`a.jpg` picture: is truncated or damaged"), "{e}");
 }
+
+#[test]
+fn folder_of_pictures_holds_one_volume() {
+    let folder = tempfile::tempdir().unwrap();
+    let picture = png((3, 2), (Grayscale, Eight), None, &[0, 1, 2, 3, 4, 5]);
+    std::fs::write(folder.path().join("a.png"), picture).unwrap();
+    let pick = |n| crate::Hints {
+        pick: crate::Pick { volume: Some(n), ..crate::Pick::default() },
+        ..crate::Hints::default()
+    };
+    assert!(crate::open_with(folder.path(), &pick(0)).is_ok());
+    let e = crate::open_with(folder.path(), &pick(1)).unwrap_err().to_string();
+    assert!(e.contains("--volume: 1 is not there: the file has 1 volume; leave it out"), "{e}");
+}

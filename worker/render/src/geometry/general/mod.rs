@@ -69,6 +69,8 @@ pub struct Queues {
     /// the buckets of all sheets each time.
     pub filled: usize,
     carried: Vec<Waiting>,
+    /// All buckets before this one that are not done have memory.
+    bare: usize,
 }
 
 impl Queues {
@@ -80,6 +82,15 @@ impl Queues {
         }
         let filled = std::mem::take(&mut self.filled);
         self.buckets[..filled].iter_mut().for_each(Vec::clear);
+        // Memory of an earlier part is where its walk ended; it is needed in front.
+        let mut with_memory = 0;
+        for at in 0..self.buckets.len() {
+            if self.buckets[at].capacity() > 0 {
+                self.buckets.swap(with_memory, at);
+                with_memory += 1;
+            }
+        }
+        self.bare = with_memory;
         self.carried.clear();
     }
 
@@ -88,6 +99,20 @@ impl Queues {
     pub fn put(&mut self, sheet: usize, voxel: Waiting) {
         self.buckets[sheet].push(voxel);
         self.filled = self.filled.max(sheet + 1);
+    }
+
+    /// Passes the memory of bucket `at`, whose sheet is done, on to the next bucket that has none.
+    #[inline(always)]
+    fn pass_on(&mut self, at: usize, memory: Vec<Waiting>) {
+        if memory.capacity() == 0 {
+            return;
+        }
+        self.bare = self.bare.max(at + 1);
+        while self.buckets.get(self.bare).is_some_and(|b| b.capacity() > 0) {
+            self.bare += 1;
+        }
+        let to = if self.bare < self.buckets.len() { self.bare } else { at };
+        self.buckets[to] = memory;
     }
 
     /// Returns the number of voxels whose first sheet drawing has not reached.
@@ -301,7 +326,7 @@ impl General<'_> {
             }
             contents.splat_all(self, &bucket, k, kind, (&open, counters));
             bucket.clear();
-            queues.buckets[(k - slab.first) as usize] = bucket;
+            queues.pass_on((k - slab.first) as usize, bucket);
             if self.close(&contents, k, &kind.planes, &mut open, pixels) {
                 any_open = open.count() > 0;
             }

@@ -121,3 +121,23 @@ fn convert_keeps_voxels_values_and_orientation() {
         (info(dir.path(), Path::new("r.bin"), &flags), info(dir.path(), Path::new("r.nrrd"), &[]));
     assert_eq!((&a["digest"], &a["values"]["max"]), (&b["digest"], &serde_json::json!(768.0)));
 }
+
+#[test]
+fn dataset_flag_takes_one_of_several_arrays() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("two.vtk");
+    let array = |name: &str, from: u32| {
+        let numbers: Vec<String> = (from..from + 8).map(|n| n.to_string()).collect();
+        format!("SCALARS {name} short\nLOOKUP_TABLE default\n{}\n", numbers.join(" "))
+    };
+    let head = "# vtk DataFile Version 3.0\ntwo arrays\nASCII\nDATASET STRUCTURED_POINTS\n\
+                DIMENSIONS 2 2 2\nORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA 8\n";
+    std::fs::write(&file, [head, &array("a", 0), &array("b", 100)].concat()).unwrap();
+    let most = |more: &[&str]| info(dir.path(), &file, more)["values"]["max"].clone();
+    assert_eq!(most(&[]), serde_json::json!(7.0));
+    assert_eq!(most(&["--dataset", "b"]), serde_json::json!(107.0));
+    let out = run(dir.path(), &["info", &file.to_string_lossy(), "--dataset", "c"]);
+    assert_eq!(out.status.code(), Some(1));
+    let said = text(&out.stderr);
+    assert!(said.contains("--dataset: there is no `c`") && said.contains("`a`, `b`"), "{said}");
+}

@@ -74,6 +74,9 @@ pub(crate) const GROUPS: [(&str, &[&str]); 4] = [
     ("Setup", &["config", "doctor", "completions", "man", "help"]),
 ];
 
+/// Commands that the short help only names: it has to fit a screen of 24 lines.
+const ALSO: [&str; 6] = ["volumes", "put", "rm", "completions", "man", "help"];
+
 const EXAMPLES: &str = "\
 Examples:
   slabcast demo                                  pictures without any file
@@ -112,11 +115,15 @@ fn find<'a>(command: &'a Command, name: &str) -> &'a Command {
 fn short_help(command: &Command) -> String {
     let mut text = String::new();
     for (group, names) in GROUPS {
-        // The last line says what `help` does.
-        for (n, name) in names.iter().filter(|name| **name != "help").enumerate() {
+        let (also, shown): (Vec<&str>, Vec<&str>) =
+            names.iter().copied().partition(|name| ALSO.contains(name));
+        for (n, name) in shown.iter().enumerate() {
             let group = if n == 0 { group } else { "" };
             // Writing to a string does not fail.
             let _ = writeln!(text, "{group:<11} {name:<12} {}", about(find(command, name)));
+        }
+        if !also.is_empty() {
+            let _ = writeln!(text, "{:<11} also {}", "", also.join(", "));
         }
     }
     text + "\nOptions: --config FILE, --log text|json, --log-level LEVEL, --version, --help\n\

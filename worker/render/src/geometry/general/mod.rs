@@ -71,6 +71,8 @@ pub struct Queues {
     carried: Vec<Waiting>,
     /// All buckets before this one that are not done have memory.
     bare: usize,
+    /// Voxels of the fullest bucket so far: all memory holds as many in the end.
+    fullest: usize,
 }
 
 impl Queues {
@@ -81,7 +83,10 @@ impl Queues {
             self.buckets.resize_with(sheets, Vec::new);
         }
         let filled = std::mem::take(&mut self.filled);
-        self.buckets[..filled].iter_mut().for_each(Vec::clear);
+        for bucket in &mut self.buckets[..filled] {
+            self.fullest = self.fullest.max(bucket.len());
+            bucket.clear();
+        }
         // Memory of an earlier part is where its walk ended; it is needed in front.
         let mut with_memory = 0;
         for at in 0..self.buckets.len() {
@@ -90,6 +95,7 @@ impl Queues {
                 with_memory += 1;
             }
         }
+        self.buckets[..with_memory].iter_mut().for_each(|b| b.reserve(self.fullest));
         self.bare = with_memory;
         self.carried.clear();
     }
@@ -325,6 +331,7 @@ impl General<'_> {
                 bucket.sort_unstable_by_key(|v| (part.brick(v.brick as usize).0.id, v.voxel));
             }
             contents.splat_all(self, &bucket, k, kind, (&open, counters));
+            queues.fullest = queues.fullest.max(bucket.len());
             bucket.clear();
             queues.pass_on((k - slab.first) as usize, bucket);
             if self.close(&contents, k, &kind.planes, &mut open, pixels) {

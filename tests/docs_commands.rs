@@ -169,6 +169,7 @@ fn shrink(words: &mut [String]) {
         let small = match words[i - 1].as_str() {
             "--size" => size.into(),
             "--pixels" | "--model-pixels" => pixels.into(),
+            "--seconds" => "0.1".into(),
             "--frames" => match words[i].split_once("..") {
                 Some((from, _)) => {
                     format!("{from}..{}", from.parse::<u32>().expect("a number") + 1)
@@ -213,8 +214,11 @@ impl Scratch {
         }
         command.env_remove("XDG_CONFIG_HOME").env_remove("XDG_CACHE_HOME");
         // A turn is short unless the line says how long; one picture has no number of frames.
-        let one = ["--azimuth", "--view", "--path"];
-        if !words.iter().any(|w| one.contains(&w.as_str())) {
+        let one = ["--azimuth", "--view", "--path", "--seconds"];
+        let picture = |w: &String| [".png", ".tif", ".jpg", ".exr"].iter().any(|e| w.ends_with(e));
+        let to = |w: &&[String]| w[0] == "-o" && picture(&w[1]);
+        let one_file = words.windows(2).any(|w| to(&w));
+        if !one_file && !words.iter().any(|w| one.contains(&w.as_str())) {
             command.env("SLABCAST_FRAMES", SMALL.1);
         }
         command

@@ -7,10 +7,10 @@ use slabcast_session::fail::{Fail, say};
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
-  slabcast cancel job-7
-  slabcast cancel job-7 --master node1:7433")]
+  slabcast cancel job-1795837666863
+  slabcast cancel job-1795837666863 --master node1:7433")]
 pub(crate) struct CancelArgs {
-    /// The job, as `slabcast jobs` names it (job-7)
+    /// The job, as `slabcast jobs` names it, like job-1795837666863
     job: String,
     #[command(flatten)]
     master: MasterArg,

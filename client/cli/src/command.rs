@@ -2,8 +2,8 @@
 
 use crate::lab::{self, LabArgs, LabCommand};
 use crate::{
-    cancel, completions, config, convert, demo, doctor, help, info, jobs, logging, man, master,
-    read_dicom, render, rerender, status, tf, volumes, worker,
+    cancel, compare, completions, config, convert, demo, doctor, help, info, jobs, logging, man,
+    master, read_dicom, render, rerender, status, tf, volumes, worker,
 };
 use clap::{Arg, Command, CommandFactory, Parser, Subcommand};
 use std::fmt::Write;
@@ -39,6 +39,7 @@ pub(crate) struct Cli {
 #[derive(Subcommand, Debug)]
 pub(crate) enum Commands {
     Render(Box<render::RenderArgs>),
+    Compare(Box<compare::CompareArgs>),
     Rerender(rerender::RerenderArgs),
     Info(info::InfoArgs),
     Convert(convert::ConvertArgs),
@@ -67,7 +68,7 @@ pub(crate) enum Commands {
 
 /// Groups of the help and their commands, in its order.
 pub(crate) const GROUPS: [(&str, &[&str]); 4] = [
-    ("Pictures", &["render", "rerender", "info", "convert", "tf", "demo"]),
+    ("Pictures", &["render", "compare", "rerender", "info", "convert", "tf", "demo"]),
     ("Cluster", &["master", "worker", "status", "jobs", "cancel", "volumes", "put", "rm"]),
     ("Laboratory", &["lab"]),
     ("Setup", &["config", "doctor", "completions", "man", "help"]),
@@ -76,7 +77,7 @@ pub(crate) const GROUPS: [(&str, &[&str]); 4] = [
 const EXAMPLES: &str = "\
 Examples:
   slabcast demo                                  pictures without any file
-  slabcast render brain.nii.gz                   18 pictures of a turn, in slabcast-out/
+  slabcast render brain.nii.gz                   36 pictures of a full turn, in slabcast-out/
   slabcast info brain.nii.gz                     what is in the file
   slabcast master --volumes scans/               a cluster: a master,
   slabcast worker --master 127.0.0.1:7433        workers, here or elsewhere,
@@ -111,7 +112,8 @@ fn find<'a>(command: &'a Command, name: &str) -> &'a Command {
 fn short_help(command: &Command) -> String {
     let mut text = String::new();
     for (group, names) in GROUPS {
-        for (n, name) in names.iter().enumerate() {
+        // The last line says what `help` does.
+        for (n, name) in names.iter().filter(|name| **name != "help").enumerate() {
             let group = if n == 0 { group } else { "" };
             // Writing to a string does not fail.
             let _ = writeln!(text, "{group:<11} {name:<12} {}", about(find(command, name)));

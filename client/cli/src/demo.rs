@@ -24,8 +24,7 @@ pub(crate) struct DemoArgs {
 /// Balls beside and inside each other, in a shell cut open.
 const VOLUME: &str = "formula:spheres:128";
 /// Flags of `render` for the demo.
-const FLAGS: [&str; 8] =
-    ["--frames", "12", "--step", "30", "--elevation", "25", "--size", "400x400"];
+const FLAGS: [&str; 6] = ["--frames", "12", "--elevation", "25", "--size", "400x400"];
 
 /// Runs the command.
 pub(crate) fn run(args: &DemoArgs) -> Result<(), Fail> {

@@ -1,5 +1,6 @@
 //! `slabcast info`: what is in a file, before anybody waits for a picture of it.
 
+use crate::orient;
 use glam::DVec3;
 use slabcast_common::brick::{BRICK_VOXELS, BrickGrid};
 use slabcast_common::quality::Compositing;
@@ -8,6 +9,7 @@ use slabcast_common::volume::{Lattice, Samples, ValueSummary, Volume, VolumeInfo
 use slabcast_scene::path::Orientation;
 use slabcast_scene::presets::{self, Levels};
 use slabcast_session::fail::{Fail, say};
+use slabcast_session::output::free_name;
 use slabcast_session::progress::bytes;
 use slabcast_session::request::AxisArgs;
 use slabcast_session::volume;
@@ -21,7 +23,8 @@ use std::path::PathBuf;
 #[command(after_help = "\
 Examples:
   slabcast info brain.nii.gz
-  slabcast info brain.nii.gz --json | jq .presets")]
+  slabcast info brain.nii.gz --json | jq .presets
+  slabcast info head.raw --orient          which way is up? all 24 in orient.png")]
 pub(crate) struct InfoArgs {
     #[arg(help = volume::VOLUME)]
     volume: PathBuf,
@@ -29,9 +32,20 @@ pub(crate) struct InfoArgs {
     axes: AxisArgs,
     #[command(flatten)]
     input: volume::InputArgs,
+    /// Draw all ways in which it may stand on one picture [default: orient.png]
+    ///
+    /// For files that do not say what is up: each of the 24 has the --up and --front that mean it.
+    #[arg(long, value_name = "FILE.png", num_args = 0..=1, require_equals = true,
+          default_missing_value = "", value_parser = orient_file)]
+    orient: Option<PathBuf>,
     /// As JSON
     #[arg(long)]
     json: bool,
+}
+
+/// Parses the file of `--orient`; empty is the usual one.
+fn orient_file(text: &str) -> Result<PathBuf, String> {
+    if text.is_empty() { Ok(PathBuf::new()) } else { slabcast_session::parse::png(text) }
 }
 
 /// Share of the volume that a preset draws.
@@ -49,6 +63,22 @@ pub(crate) fn run(args: &InfoArgs) -> Result<(), Fail> {
     let volume = args.input.open(&args.volume)?;
     let orientation = args.axes.for_volume(&volume)?;
     let info = volume.info(volume.digest());
+    if let Some(path) = &args.orient {
+        if volume.anatomical {
+            return Err(Fail::usage(
+                "--orient: the file itself says what is up and in front; there is nothing to guess",
+            ));
+        }
+        let own = path.as_os_str().is_empty();
+        let path = &if own { free_name("orient.png".as_ref()) } else { path.clone() };
+        if path.exists() {
+            return Err(Fail::failed(format!(
+                "{}: is there already; remove it, or give --orient=OTHER.png",
+                path.display()
+            )));
+        }
+        return orient::draw(&volume, &info, path);
+    }
     let shares = shares(&volume, &info)?;
     if args.json {
         return say(&format!("{:#}\n", json(&volume, &info, orientation, &shares)));
@@ -218,7 +248,7 @@ fn text(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
             format!("up {} ({}), front {} ({})", o.up, anatomy(o.up), o.front, anatomy(o.front))
         } else {
             format!(
-                "up {}, front {}; the file does not say what is up: see --up and --front",
+                "up {}, front {}; the file does not say what is up: see --orient, --up and --front",
                 o.up, o.front
             )
         },

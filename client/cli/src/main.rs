@@ -11,6 +11,7 @@
 
 mod cancel;
 mod command;
+mod compare;
 mod completions;
 mod config;
 mod convert;
@@ -24,6 +25,7 @@ mod logging;
 mod man;
 mod master;
 mod master_client;
+mod orient;
 mod read_dicom;
 mod render;
 mod rerender;
@@ -63,6 +65,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
     match &cli.command {
         Commands::Render(args) => render::run(args),
         Commands::Rerender(args) => rerender::run(args),
+        Commands::Compare(args) => compare::run(args),
         Commands::Info(args) => info::run(args),
         Commands::Convert(args) => convert::run(args),
         Commands::Tf(args) => tf::run(args),

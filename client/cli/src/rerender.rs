@@ -3,14 +3,14 @@
 use crate::render;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::output::provenance::{self, Provenance};
-use slabcast_session::output::{Output, OutputArgs};
+use slabcast_session::output::{Output, OutputArgs, free_name};
 use slabcast_session::{progress, volume};
 use std::path::PathBuf;
 
 /// Renders a picture again from the record inside it.
 ///
-/// Then compares the two files. Pictures that slabcast writes (PNG of 8 or 16 bits, EXR, moving
-/// PNG) say what made them: the volume's digest, transfer function, view, quality and version. With
+/// Then compares the two files. Pictures that slabcast writes (PNG of 8 or 16 bits, EXR, TIFF, JPEG,
+/// moving PNG) say what made them: the volume's digest, transfer function, view, quality and version. With
 /// the same volume the new file has the same bytes, on any machine.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
@@ -22,14 +22,14 @@ Examples:
 What a picture says of itself is JSON: --show prints it. It names no person, file, machine or
 time. Exit code 1: the volume is another one, or the bytes differ.")]
 pub(crate) struct RerenderArgs {
-    /// PNG or EXR that slabcast wrote
+    /// PNG, EXR, TIFF or JPEG that slabcast wrote
     picture: PathBuf,
     /// The volume that it shows
     #[arg(required_unless_present = "show")]
     volume: Option<PathBuf>,
     #[command(flatten)]
     input: volume::InputArgs,
-    /// File for the new picture [default: again.png, with the ending of PICTURE]
+    /// File for the new picture [default: again.png, then again-2.png, with the ending of PICTURE]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Replace a file that is there already
@@ -52,19 +52,20 @@ pub(crate) fn run(args: &RerenderArgs) -> Result<(), Fail> {
         return say(&(json + "\n"));
     };
     let ending = args.picture.extension().unwrap_or_default();
-    let target =
-        args.output.clone().unwrap_or_else(|| PathBuf::from("again").with_extension(ending));
+    let own = PathBuf::from("again").with_extension(ending);
+    let own = || if args.force { own.clone() } else { free_name(&own) };
+    let target = args.output.clone().unwrap_or_else(own);
     let request = made.request();
     let output = OutputArgs {
-        output: target.clone(),
+        output: Some(target.clone()),
         format: Some(made.format),
-        fps: made.fps.unwrap_or(1),
+        fps: made.fps,
         contact_sheet: None,
         force: args.force,
+        figure: made.figure.clone(),
     };
-    let frames = request.frames();
     let inputs = [args.picture.as_path(), file.as_path()];
-    let (output, _) = Output::look(&output, "frame", frames, request.background, &inputs)?;
+    let (output, _) = Output::look(&output, "frame", &request, &inputs)?;
     let volume = args.input.open(file)?;
     let digest = volume.digest().to_string();
     if digest != made.volume_sha256 {

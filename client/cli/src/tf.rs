@@ -1,13 +1,13 @@
 //! `slabcast tf`: transfer functions as files, for people who want to change one, and for ParaView.
 
-use slabcast_common::transfer::{Domain, TransferFunction};
+use slabcast_common::transfer::TransferFunction;
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_common::volume::{Samples, ValueMap, ValueSummary, VolumeInfo};
 use slabcast_scene::paraview;
 use slabcast_scene::presets;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::output::write_atomic;
-use slabcast_session::transfer::{Transfer, TransferFlags};
+use slabcast_session::transfer::{NameOrFile, Transfer, TransferFlags, in_values};
 use slabcast_session::volume::InputArgs;
 use std::io::Write;
 use std::path::PathBuf;
@@ -30,7 +30,8 @@ In a file without a volume, 0 is the smallest and 1 the largest value. ParaView'
 colours, opacities and the colour of NaN; light and gradients stay with ours.")]
 pub(crate) struct TfArgs {
     /// A preset, a colour map or a JSON file
-    #[arg(required_unless_present = "list")]
+    #[arg(required_unless_present = "list", value_parser = NameOrFile::TRANSFER,
+          hide_possible_values = true)]
     tf: Option<String>,
     /// The volume that it is fitted to; its values are x then
     volume: Option<PathBuf>,
@@ -75,15 +76,12 @@ pub(crate) fn run(args: &TfArgs) -> Result<(), Fail> {
         None => None,
     };
     let refused = |e| Fail::failed(format!("{name}: {e}"));
-    let mut tf = transfer.function(info.as_ref().unwrap_or(&any())).map_err(refused)?;
+    let tf = transfer.function(info.as_ref().unwrap_or(&any())).map_err(refused)?;
     let range = info.as_ref().map(|i| i.summary.range());
     let text = if args.paraview {
         paraview::to_json(&tf, &transfer.title(), range).map_err(refused)?
     } else {
-        if let Some((lo, hi)) = range {
-            in_values(&mut tf, lo, hi);
-        }
-        pretty(&tf)
+        pretty(&info.as_ref().map_or_else(|| tf.clone(), |info| in_values(&tf, info)))
     };
     match &args.output {
         None => say(&text),
@@ -97,16 +95,6 @@ fn any() -> VolumeInfo {
     let summary = ValueSummary::from_samples(&samples, ValueMap::IDENTITY);
     let volume = Volume::from_fn_u8("any", [1; 3], |_, _, _| 0);
     VolumeInfo { summary, ..volume.info(Digest32::default()) }
-}
-
-/// Returns the function over values of the file.
-fn in_values(tf: &mut TransferFunction, lo: f64, hi: f64) {
-    if tf.domain == Domain::Unit {
-        let x = |x: f64| lo + x * (hi - lo);
-        tf.colors.iter_mut().for_each(|c| c[0] = x(c[0]));
-        tf.opacities.iter_mut().for_each(|o| o[0] = x(o[0]));
-        tf.domain = Domain::Value;
-    }
 }
 
 /// A point a line.

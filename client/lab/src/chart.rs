@@ -1,13 +1,13 @@
 //! Charts as SVG and as PNG, on a light and on a dark ground.
 //!
 //! Drawn by plotters: its SVG writer, and its bitmap writer, whose letters are our own
-//! ([`crate::letters`]). One drawing function serves both; [`Sheet`] hides the writer and the size
+//! ([`slabcast_session::letters`]). One drawing function serves both; [`Sheet`] hides the writer and the size
 //! of a pixel. Text is measured in the same font, so that labels never overlap.
 
-use crate::letters::{self, Way};
 use plotters::coord::Shift;
 use plotters::prelude::*;
 use slabcast_session::fail::Fail;
+use slabcast_session::letters::{self, Way};
 use slabcast_session::output::write_atomic;
 use std::io::Write;
 use std::path::Path;

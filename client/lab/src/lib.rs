@@ -23,7 +23,6 @@ mod chart;
 pub mod check;
 pub mod error;
 pub mod explain;
-mod letters;
 pub mod plan;
 mod plot;
 pub mod replay;

@@ -1,6 +1,7 @@
 //! A small drawing board for pictures about pictures: fills, pictures side by side, a scale of
 //! colours, and words in a font of dots.
 
+use crate::letters::{self, Way};
 use crate::software::{SOFTWARE, io_error};
 use slabcast_common::image::{Background, Picture, PixelFormat};
 use std::io::Write;
@@ -102,6 +103,23 @@ impl Canvas {
                 }
             }
         }
+    }
+
+    /// Writes a line of text in the program's font, `em` pixels large, on a base line that begins at
+    /// `x`, `y`; parts outside are left out.
+    pub fn label(&mut self, [x, y]: [f64; 2], em: f64, text: &str, colour: [u8; 3]) {
+        let [w, h] = self.size.map(|n| n as i32);
+        let drawn = letters::draw(text, em, (x, y), Way::Right, |(x, y), covered| {
+            if (0..w).contains(&x) && (0..h).contains(&y) {
+                let i = (y * w + x) as usize * 3;
+                for (old, new) in self.bytes[i..i + 3].iter_mut().zip(colour) {
+                    let mixed = f64::from(*old) * (1.0 - covered) + f64::from(new) * covered;
+                    *old = (mixed + 0.5) as u8;
+                }
+            }
+            Ok::<(), std::convert::Infallible>(())
+        });
+        drawn.unwrap_or_else(|never| match never {});
     }
 
     /// Encodes the board as a PNG with text chunks `about` (key and text).

@@ -6,7 +6,8 @@
 //! - [`embedded`] renders it by a master and workers in this process, [`remote`] by a cluster
 //!   behind a network; both deliver frames through a [`source`]. [`direct`] draws on threads alone,
 //!   without master or scheduler, the frames that [`path_scenes`] prepares.
-//! - [`output`] writes frames to files or pipes and says in each picture what made it.
+//! - [`output`] writes frames to files or pipes and says in each picture what made it; [`figure`]
+//!   draws scale bars, legends and the like over them.
 //! - [`progress`], [`terminal`], [`signals`] and [`fail`] are a command's manners: what a person
 //!   sees meanwhile, and how it ends.
 //!
@@ -16,6 +17,8 @@ pub mod canvas;
 pub mod direct;
 pub mod embedded;
 pub mod fail;
+pub mod figure;
+pub mod letters;
 pub mod machine;
 pub mod magnify;
 pub mod output;

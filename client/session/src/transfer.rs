@@ -2,6 +2,7 @@
 
 use crate::fail::Fail;
 use crate::parse;
+use clap::builder::{PossibleValue, TypedValueParser};
 use slabcast_common::quality::InvalidField;
 use slabcast_common::shade::Light;
 use slabcast_common::spelling;
@@ -16,6 +17,35 @@ use std::path::{Path, PathBuf};
 /// Largest transfer function or path file that is read: a path of 100,000 views has 20 MB.
 const MAX_JSON_BYTES: u64 = 64 << 20;
 
+/// Parses a name of a list, or any other text: what shells complete are the names.
+#[derive(Clone)]
+pub struct NameOrFile(&'static [&'static [(&'static str, &'static str)]]);
+
+impl NameOrFile {
+    /// Presets, colour maps, or a file.
+    pub const TRANSFER: NameOrFile = NameOrFile(&[&presets::NAMES, &presets::MAPS]);
+    /// Colour maps, or a file.
+    pub const MAP: NameOrFile = NameOrFile(&[&presets::MAPS]);
+}
+
+impl TypedValueParser for NameOrFile {
+    type Value = String;
+
+    fn parse_ref(
+        &self,
+        command: &clap::Command,
+        arg: Option<&clap::Arg>,
+        value: &std::ffi::OsStr,
+    ) -> Result<String, clap::Error> {
+        clap::builder::StringValueParser::new().parse_ref(command, arg, value)
+    }
+
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        let names = self.0.iter().flat_map(|list| list.iter());
+        Some(Box::new(names.map(|(name, what)| PossibleValue::new(*name).help(*what))))
+    }
+}
+
 /// A transfer function with its origin and the changes of flags.
 #[derive(clap::Args, Clone, Debug)]
 pub struct TransferFlags {
@@ -23,7 +53,7 @@ pub struct TransferFlags {
     ///
     /// viridis, inferno, magma, plasma, cividis, turbo, cool-warm, greys, or a ParaView file;
     /// spread over the values that the transfer function shows.
-    #[arg(long, value_name = "MAP|FILE")]
+    #[arg(long, value_name = "MAP|FILE", value_parser = NameOrFile::MAP, hide_possible_values = true)]
     colors: Option<String>,
     /// Light source: key (up left of the eye), head (the eye), or a direction in world axes
     #[arg(long, value_name = "key|head|X,Y,Z", value_parser = parse::light, allow_hyphen_values = true,
@@ -110,6 +140,16 @@ impl Transfer {
         }
     }
 
+    /// Returns the function as it is for another volume, in that volume's values, with the changes of
+    /// flags.
+    ///
+    /// # Errors
+    /// It doesn't fit that volume.
+    pub fn fitted_to(&self, other: &VolumeInfo) -> Result<Self, InvalidField> {
+        let tf = in_values(&self.function(other)?, other);
+        Ok(Transfer::from_function(&tf, self.preset().map(String::from)))
+    }
+
     /// Returns the transfer function without light.
     pub fn unshaded(&self) -> Self {
         Transfer { light: None, shading: Some(false), ..self.clone() }
@@ -156,6 +196,9 @@ impl Transfer {
     pub fn function(&self, info: &VolumeInfo) -> Result<TransferFunction, InvalidField> {
         let mut tf = match &self.base {
             TransferChoice::Name(name) => presets::by_name(name, &info.summary)?,
+            TransferChoice::Function(tf) if self.file.is_some() => {
+                printed_preset(tf, info).unwrap_or_else(|| (**tf).clone())
+            }
             TransferChoice::Function(tf) => (**tf).clone(),
         };
         if let Some(colours) = &self.colours {
@@ -180,12 +223,45 @@ impl Transfer {
             || self.light.is_some()
             || self.shading.is_some()
             || self.nan.is_some();
-        match self.function(info) {
-            Ok(tf) if changed => TransferChoice::Function(Box::new(tf)),
+        match (self.function(info), &self.base) {
+            (Ok(tf), TransferChoice::Function(_)) => TransferChoice::Function(Box::new(tf)),
+            (Ok(tf), _) if changed => TransferChoice::Function(Box::new(tf)),
             // What can't be made is refused by the master in the words of `fit`.
             _ => self.base.clone(),
         }
     }
+}
+
+/// Returns a function over shares of a volume's range as one over its values, for people to change.
+///
+/// Points are off by what a rounding of the last digit makes of them. [`Transfer::function`] knows a
+/// preset that was not changed by its numbers, and draws it to the bit.
+pub fn in_values(tf: &TransferFunction, info: &VolumeInfo) -> TransferFunction {
+    if tf.domain == Domain::Value {
+        return tf.clone();
+    }
+    let (lo, hi) = info.summary.range();
+    let x = |x: f64| lo + x * (hi - lo);
+    // Shares of the range over one vox become values over a unit of length.
+    let slope = (hi - lo) / info.lattice.vox();
+    TransferFunction {
+        domain: Domain::Value,
+        colors: tf.colors.iter().map(|c| [x(c[0]), c[1], c[2], c[3]]).collect(),
+        opacities: tf.opacities.iter().map(|o| [x(o[0]), o[1]]).collect(),
+        gradient_opacity: tf.gradient_opacity.iter().map(|g| [g[0] * slope, g[1]]).collect(),
+        ..tf.clone()
+    }
+}
+
+/// Returns the preset whose numbers, in this volume's values, are exactly those of a function that
+/// was read from a file; `None` if there is none.
+fn printed_preset(tf: &TransferFunction, info: &VolumeInfo) -> Option<TransferFunction> {
+    if tf.domain != Domain::Value {
+        return None;
+    }
+    let names = presets::NAMES.iter().chain(&presets::MAPS);
+    let mut all = names.filter_map(|(name, _)| presets::by_name(name, &info.summary).ok());
+    all.find(|preset| in_values(preset, info) == *tf)
 }
 
 /// The x between which a function shows anything, within the volume's values.
@@ -203,6 +279,18 @@ fn shown(tf: &TransferFunction, info: &VolumeInfo) -> (f64, f64) {
     let end = tf.colors.last().map_or(to, |c| c[0]);
     let to = if end > from { to.min(end) } else { to };
     if to > from { (from, to) } else { (lo, hi) }
+}
+
+/// Returns the values of the file between which a function shows anything.
+pub fn shown_values(tf: &TransferFunction, info: &VolumeInfo) -> (f64, f64) {
+    let (from, to) = shown(tf, info);
+    match tf.domain {
+        Domain::Value => (from, to),
+        Domain::Unit => {
+            let (lo, hi) = info.summary.range();
+            (lo + (hi - lo) * from, lo + (hi - lo) * to)
+        }
+    }
 }
 
 fn is_name(text: &str) -> bool {
@@ -262,4 +350,82 @@ pub fn read_json(path: &Path) -> Result<String, Fail> {
     }
     String::from_utf8(bytes)
         .map_err(|_| Fail::failed(format!("{}: is not text; give a JSON file", path.display())))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use slabcast_common::volume::{Digest32, Volume};
+    use std::io::Write;
+
+    fn round_trip(volume: &Volume, dir: &Path) {
+        let info = volume.info(Digest32::default());
+        for (name, _) in presets::NAMES.iter().chain(&presets::MAPS) {
+            let preset = Transfer::from_name(name).unwrap().function(&info).unwrap();
+            let file = dir.join("tf.json");
+            std::fs::write(&file, in_values(&preset, &info).to_json()).unwrap();
+            let flags = TransferFlags { colors: None, light: None, shading: None, nan: None };
+            let read = Transfer::parse(file.to_str().unwrap(), &flags).unwrap();
+            assert_eq!(read.function(&info).unwrap(), preset, "{name} of {}", volume.name);
+            let TransferChoice::Function(sent) = read.choice(&info) else { panic!("a function") };
+            assert_eq!(*sent, preset, "{name} of {}", volume.name);
+        }
+    }
+
+    #[test]
+    fn a_preset_that_was_printed_is_the_same_preset() {
+        let dir = tempfile::tempdir().unwrap();
+        let formulas = ["spheres:24", "ramp:16", "blob:24", "fog:16", "marker:24", "one", "full:8"];
+        for name in formulas {
+            round_trip(
+                &crate::volume::open(format!("formula:{name}").as_ref()).unwrap(),
+                dir.path(),
+            );
+        }
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+        round_trip(
+            &crate::volume::open(&root.join("samples/mni152_t1.nii.gz")).unwrap(),
+            dir.path(),
+        );
+        for name in ["tooth.nrrd", "lidc2.nrrd", "heptane.nrrd", "chris_t1.nrrd"] {
+            let file = root.join("../shared/data").join(name);
+            if !file.exists() {
+                // A direct write: the test harness captures only what the macros print.
+                let _ = writeln!(std::io::stderr(), "skipped: needs shared/data ({name})");
+                continue;
+            }
+            round_trip(&crate::volume::open(&file).unwrap(), dir.path());
+        }
+    }
+
+    #[test]
+    fn a_function_in_values_is_that_in_shares() {
+        use slabcast_common::quality::Compositing;
+        use slabcast_common::transfer::Classifier;
+        let volume = crate::volume::open("formula:spheres:24".as_ref()).unwrap();
+        let info = volume.info(Digest32::default());
+        for name in ["glass", "skin", "fire"] {
+            let preset = presets::by_name(name, &info.summary).unwrap();
+            let [a, b] = [preset.clone(), in_values(&preset, &info)]
+                .map(|tf| Classifier::new(&tf, &info, Compositing::Linear));
+            for i in 0..400 {
+                let (share, code) = (f64::from(i) / 400.0, f64::from(i) * 0.6);
+                let (fa, fb) = (a.gradient_factor(share), b.gradient_factor(share));
+                assert!((fa - fb).abs() < 1e-9, "{name} at gradient {share}: {fa}, {fb}");
+                let (oa, ob) = (a.optics_at(code), b.optics_at(code));
+                assert!((0..4).all(|c| (oa[c] - ob[c]).abs() < 1e-9), "{name} at {code}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_look_of_another_volume_is_in_its_values() {
+        let open = |name: &str| crate::volume::open(name.as_ref()).unwrap();
+        let (a, b) = (open("formula:spheres:24"), open("formula:ramp:16"));
+        let [a, b] = [a, b].map(|v| v.info(Digest32::default()));
+        let fitted = Transfer::from_name("skin").unwrap().fitted_to(&a).unwrap();
+        let (one, other) = (fitted.function(&a).unwrap(), fitted.function(&b).unwrap());
+        assert_eq!((one.domain, &one), (Domain::Value, &other));
+        assert_eq!(fitted.preset(), Some("skin"));
+    }
 }

@@ -28,7 +28,7 @@ pub struct InputArgs {
     #[arg(long, value_name = "ORDER", value_parser = parse::byte_order, help_heading = HEADING,
           hide_short_help = true)]
     byte_order: Option<bool>,
-    /// Distances of samples of raw numbers or TIFF pictures, such as 0.5x0.5x1.25 [default: 1x1x1]
+    /// Distances of samples of raw numbers, pictures or NumPy arrays, such as 0.5x0.5x1.25 [default: 1x1x1]
     #[arg(long, value_name = "AxBxC", value_parser = parse::spacing, help_heading = HEADING,
           hide_short_help = true)]
     spacing: Option<[f64; 3]>,
@@ -40,6 +40,10 @@ pub struct InputArgs {
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     series: Option<String>,
+    /// Which array of a file of several (.npz, .vtk): its name [default: the only one, or the first]
+    #[arg(long, value_name = "NAME", help_heading = HEADING,
+          hide_short_help = true)]
+    dataset: Option<String>,
     /// Which level of an OME-Zarr pyramid, 0 the finest [default: the finest that fits]
     #[arg(long, value_name = "N", allow_negative_numbers = true, help_heading = HEADING,
           hide_short_help = true)]
@@ -91,6 +95,7 @@ impl InputArgs {
         Hints {
             raw,
             series: self.series.clone(),
+            dataset: self.dataset.clone(),
             dicom_reader: dicom_reader(),
             level: self.level,
             max_bytes: self.max_bytes,

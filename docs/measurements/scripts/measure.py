@@ -81,7 +81,7 @@ def run(binary, volume, tf, axes, workers, options, folder, told=True):
         begin = time.monotonic()
         client = subprocess.run(
             [binary, "render", "--master", address, "--tf", tf, "--size", options.size,
-             "--frames", str(options.frames), *(["--stats", stats] if told else []), "-o", out,
+             "--frames", str(options.frames), *([] if "--step" in options.extra else ["--step", "5"]), *(["--stats", stats] if told else []), "-o", out,
              *options.extra],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True)
         wall = time.monotonic() - begin

@@ -1,5 +1,4 @@
-//! Opens a folder: a Zarr array or pyramid, the slices of a DICOM series, or the pictures of a TIFF
-//! stack. For any other folder the error names a volume file in it.
+//! Opens a folder: a Zarr array or pyramid, the slices of a DICOM series, or the pictures of a stack. For any other folder the error names a volume file in it.
 
 #[cfg(feature = "dicom")]
 use crate::dicom;
@@ -7,7 +6,7 @@ use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::source::{Folder, Inside};
 #[cfg(feature = "zarr")]
 use crate::zarr;
-use crate::{Hints, Opened, tiff_stack};
+use crate::{Hints, Opened, pictures, tiff_stack, unread};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -35,27 +34,74 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
             return dicom::open(&slices, folder, hints, None).map_err(|p| point_below(folder, p));
         }
     }
-    let pictures = matching(tiff_stack::sniff);
-    if !pictures.is_empty() {
-        return tiff_stack::read_files(pictures, &name, &hints.raw, hints.cap());
+    let tiffs = matching(tiff_stack::sniff);
+    if !tiffs.is_empty() {
+        return tiff_stack::read_files(tiffs, &name, &hints.raw, hints.cap());
     }
-    // Suggest volume files that the user may have meant.
-    const ENDS: [&str; 9] =
-        [".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd", ".vti", ".raw", ".raw.gz"];
-    let mut volumes = files.iter().filter_map(|(path, _)| {
-        let name = path.file_name()?.to_string_lossy().into_owned();
-        ENDS.iter().any(|end| name.to_ascii_lowercase().ends_with(end)).then(|| quoted(&name))
-    });
-    let (one, two) = (volumes.next(), volumes.next());
-    let volumes_in_it = one.is_some();
-    let remedy = match (one, two) {
-        (None, _) => "give a file, or a folder with the slices or pictures of one volume".into(),
-        (Some(one), None) => format!("give the file {one} in it"),
-        (Some(one), Some(two)) => format!("give one file in it, such as {one} or {two}"),
+    // Volume files that the user may have meant. A picture beside one may be its preview.
+    const ENDS: [&str; 18] = [
+        ".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd", ".vti", ".raw", ".raw.gz", ".hdr",
+        ".mgz", ".mgh", ".mrc", ".map", ".rec", ".npy", ".npz", ".vtk",
+    ];
+    let volumes: Vec<String> = files
+        .iter()
+        .filter_map(|(path, _)| {
+            let name = path.file_name()?.to_string_lossy().into_owned();
+            ENDS.iter().any(|end| name.to_ascii_lowercase().ends_with(end)).then(|| quoted(&name))
+        })
+        .collect();
+    let (png, jpeg) = (matching(pictures::is_png), matching(pictures::is_jpeg));
+    let has_pictures = !png.is_empty() || !jpeg.is_empty();
+    if has_pictures && volumes.is_empty() {
+        let (chosen, left_out) = if png.is_empty() { (jpeg, 0) } else { (png, jpeg.len()) };
+        let mut opened = pictures::read_files(chosen, &name, &hints.raw, hints.cap())?;
+        if left_out > 0 {
+            opened
+                .notes
+                .push(format!("{left_out} JPEG pictures beside the PNG ones were not read"));
+        }
+        return Ok(opened);
+    }
+    let remedy = match &volumes[..] {
+        [] => return Err(point_below(folder, no_volume(folder, &files))),
+        [one] => format!("give the file {one} in it"),
+        [one, two, ..] => format!("give one file in it, such as {one} or {two}"),
     };
-    let problem =
-        Problem::new(OpenErrorKind::NotAVolume, "folder", "holds no slices or pictures", remedy);
-    Err(if volumes_in_it { problem } else { point_below(folder, problem) })
+    let (what, remedy) = match has_pictures {
+        true => (
+            "holds pictures and volume files",
+            format!("{remedy}, or a folder of the pictures alone"),
+        ),
+        false => ("holds no slices or pictures", remedy),
+    };
+    Err(Problem::new(OpenErrorKind::NotAVolume, "folder", what, remedy))
+}
+
+/// Returns the error for a folder without volumes, which names what is in it if that is known.
+fn no_volume(folder: &Path, files: &[(PathBuf, Vec<u8>)]) -> Problem {
+    let problem = |what: String, remedy: &str| {
+        Problem::new(OpenErrorKind::NotAVolume, "folder", what, remedy)
+    };
+    if folder.join("attributes.json").is_file() {
+        return problem(
+            "is N5, or holds attributes.json of it, which is not read".into(),
+            "copy it to Zarr in Python, with zarr 2 (zarr.n5.N5Store and zarr.copy)",
+        );
+    }
+    let known = files.iter().find_map(|(path, head)| {
+        let name = path.file_name()?.to_string_lossy().into_owned();
+        unread::known(head, &name).map(|known| (name, known))
+    });
+    match known {
+        Some((name, (what, remedy))) => problem(
+            format!("holds no slices or pictures, but {}, which {what}", quoted(&name)),
+            remedy,
+        ),
+        None => problem(
+            "holds no slices or pictures".into(),
+            "give a file, or a folder with the slices or pictures of one volume",
+        ),
+    }
 }
 
 /// Most folders looked into, and the deepest level, below one without a picture: a CD has some
@@ -135,7 +181,7 @@ pub(crate) fn open_series_of(file: &Path, hints: &Hints) -> Result<Opened, Probl
         dicom::open(&slices, folder, hints, file_given).map_err(|p| point_below(folder, p))?;
     let name = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let count = opened.volume.lattice.dims[2];
-    if count > 1 {
+    if count > 1 && slices.len() > 1 {
         opened
             .notes
             .insert(0, format!("{name} is one of {count} slices; its whole series was read"));

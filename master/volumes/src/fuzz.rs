@@ -463,6 +463,106 @@ fn tiff_mutants_neither_panic_nor_hang_nor_fill_memory() {
     survive_files("tiff", Path::new("/nonexistent"), |rng| seed_or_mutant(rng, &seeds));
 }
 
+/// Readers of one file from front to back, each plain and inside gzip.
+fn survive_plain(what: &str, seeds: &[Vec<u8>]) {
+    survive_files(what, Path::new("/nonexistent"), |rng| {
+        let bytes = seed_or_mutant(rng, seeds);
+        match rng.below(4) {
+            0 => {
+                let mut bytes = gzip(&bytes);
+                if rng.below(2) == 0 {
+                    rng.mutate(&mut bytes, seeds);
+                }
+                bytes
+            }
+            _ => bytes,
+        }
+    });
+}
+
+#[test]
+fn numpy_mutants_neither_panic_nor_hang_nor_fill_memory() {
+    use crate::npy::tests::{archive, npy};
+    let arrays = [
+        npy(1, "<u2", false, "(2, 3, 4)"),
+        npy(2, ">f8", true, "(2, 3, 4)"),
+        npy(3, "<f2", false, "(1, 2, 3, 4)"),
+        npy(1, "|b1", false, "(2, 3, 4)"),
+    ];
+    let mut seeds = arrays.to_vec();
+    seeds.push(archive(&[("a.npy", &arrays[0])], true));
+    seeds.push(archive(&[("a.npy", &arrays[1]), ("b.txt", b"text")], false));
+    seeds.push(archive(&[("a.npy", &arrays[2]), ("b.npy", &arrays[0])], true));
+    survive_plain("numpy", &seeds);
+}
+
+#[test]
+fn freesurfer_mutants_neither_panic_nor_hang_nor_fill_memory() {
+    use crate::mgh::tests::mgh;
+    survive_plain("mgh", &[0, 1, 3, 4, 10].map(|kind| mgh(kind, kind != 1)));
+}
+
+#[test]
+fn mrc_mutants_neither_panic_nor_hang_nor_fill_memory() {
+    use crate::mrc::tests::mrc;
+    let seed = |mode| mrc(mode % 2 == 0, mode, [3, 1, 2], mode != 6);
+    survive_plain("mrc", &[0, 1, 2, 6, 12].map(seed));
+}
+
+#[test]
+fn legacy_vtk_mutants_neither_panic_nor_hang_nor_fill_memory() {
+    use crate::vtk::tests::vtk;
+    let seeds: Vec<Vec<u8>> = [(true, true), (true, false), (false, true), (false, false)]
+        .into_iter()
+        .flat_map(|(text, field)| ["short", "double"].map(|kind| vtk(text, kind, field)))
+        .collect();
+    survive_plain("vtk", &seeds);
+}
+
+#[test]
+fn png_and_jpeg_mutants_neither_panic_nor_hang_nor_fill_memory() {
+    use crate::pictures::tests::{jpeg, png};
+    use png::{BitDepth, ColorType};
+    let rows: Vec<u8> = (0..96).map(|i| i * 2).collect();
+    let seeds = [
+        png((8, 6), (ColorType::Grayscale, BitDepth::Eight), None, &rows[..48]),
+        png((8, 6), (ColorType::Grayscale, BitDepth::Sixteen), None, &rows),
+        png((8, 6), (ColorType::Indexed, BitDepth::Four), Some(&[9; 48]), &rows[..24]),
+        jpeg(false),
+        jpeg(true),
+    ];
+    survive(
+        "pictures",
+        mutants(),
+        |rng| seed_or_mutant(rng, &seeds),
+        |bytes| crate::pictures::one_picture(Source::from_bytes(bytes)).map(|_| None),
+    );
+}
+
+/// Mutates the headers; the samples beside them stay as they are.
+#[test]
+fn pair_mutants_neither_panic_nor_hang_nor_fill_memory() {
+    use crate::nifti::pair::tests::{analyze, nifti_pair};
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("a.img"), [7; 96]).unwrap();
+    let seeds: Vec<Vec<u8>> = [false, true]
+        .into_iter()
+        .flat_map(|big| [analyze(big, 4, [4, 3, 2]), nifti_pair(big, 2, [4, 3, 2]).0])
+        .collect();
+    survive(
+        "pair",
+        mutants(),
+        |rng| {
+            let bytes = seed_or_mutant(rng, &seeds);
+            if rng.below(4) == 0 { gzip(&bytes) } else { bytes }
+        },
+        |bytes| {
+            let source = Source::from_bytes(bytes);
+            read(source, folder.path(), "a.hdr", &Hints::default()).map(Some)
+        },
+    );
+}
+
 #[test]
 fn raw_mutants_neither_panic_nor_hang_nor_fill_memory() {
     let seeds = [(0..24).collect::<Vec<u8>>(), gzip(&(0..24).collect::<Vec<u8>>())];
@@ -474,13 +574,28 @@ fn raw_mutants_neither_panic_nor_hang_nor_fill_memory() {
 fn dicom_mutants_neither_panic_nor_hang_nor_fill_memory() {
     use crate::dicom::tests::{ALL, slice};
     let pixels = [1, -2, 300, 4, 5, 6];
-    let seeds: Vec<Vec<u8>> =
-        ALL.iter().map(|syntax| slice(*syntax, "1.2.3", 1.0, &pixels, &[("slope", "2")])).collect();
+    let one = |syntax: &_| slice(*syntax, "1.2.3", 1.0, &pixels, &[("slope", "2")]);
+    let frames = [(1.0, 1.0, 10), (0.0, 2.0, 20)];
+    let several = [(false, false), (false, true), (true, false), (true, true)]
+        .map(|(packed, delimited)| crate::dicom::enhanced(&frames, packed, delimited));
+    let seeds: Vec<Vec<u8>> = ALL.iter().map(one).chain(several).collect();
     survive(
         "dicom",
         mutants(),
         |rng| seed_or_mutant(rng, &seeds),
         |bytes| crate::dicom::one_slice(Source::from_bytes(bytes)).map(|_| None),
+    );
+}
+
+#[cfg(feature = "dicom")]
+#[test]
+fn jpeg_ls_mutants_neither_panic_nor_hang_nor_fill_memory() {
+    let seeds = crate::dicom::encoded_pictures();
+    survive(
+        "jpeg-ls",
+        mutants(),
+        |rng| seed_or_mutant(rng, &seeds),
+        |bytes| crate::dicom::one_jpeg_ls(&bytes).map(|_| None),
     );
 }
 

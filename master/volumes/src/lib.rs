@@ -22,15 +22,16 @@
 //!
 //! - NRRD: `.nrrd`, and `.nhdr` with its data files
 //! - MetaImage: `.mha`, and `.mhd` with its data files
-//! - NIfTI-1 and NIfTI-2 in one file: `.nii`, `.nii.gz`
-//! - VTK image data in XML: `.vti`
-//! - TIFF: the pages of one file, or a folder of single pages
+//! - NIfTI-1 and NIfTI-2 in one file, and pairs of NIfTI and ANALYZE 7.5: `.nii`, `.hdr` with `.img`
+//! - FreeSurfer's `.mgh` and `.mgz`, MRC and CCP4 maps, NumPy's `.npy` and `.npz`
+//! - VTK image data in XML: `.vti`; legacy structured points: `.vtk`
+//! - TIFF: the pages of one file, or a folder of single pages; PNG and JPEG: a folder of them
 //! - raw numbers, with size and type from flags or from the file's name
 //! - DICOM series, one folder of slices (feature `dicom`)
 //! - Zarr arrays of versions 2 and 3, and OME-Zarr pyramids (feature `zarr`)
 //!
-//! [`write`](mod@write) writes NRRD and NIfTI-1. Not read: NIfTI pairs, colours, time series, and
-//! volumes larger than memory.
+//! [`write`](mod@write) writes NRRD and NIfTI-1. Not read: colours, time series, and volumes
+//! larger than memory.
 //!
 //! Input files are not trusted. A size in a header takes no memory before the bytes were seen;
 //! nothing outside the header's folder is read; every refusal is one line that names the file, the
@@ -44,6 +45,7 @@ mod data;
 pub mod dicom;
 mod error;
 mod folder;
+mod format;
 pub mod formula;
 pub mod framing;
 #[cfg(test)]
@@ -51,12 +53,17 @@ mod fuzz;
 mod limit;
 mod members;
 mod metaimage;
+mod mgh;
+mod mrc;
 mod nifti;
+mod npy;
 mod nrrd;
 mod numbers;
 #[cfg(test)]
 mod phantom;
 mod pick;
+mod pictures;
+mod plain;
 mod prefilter;
 mod raw;
 mod samples;
@@ -66,7 +73,9 @@ mod store;
 mod tiff_stack;
 mod units;
 mod unpack;
+mod unread;
 mod vti;
+mod vtk;
 mod wide;
 pub mod write;
 #[cfg(feature = "zarr")]
@@ -79,6 +88,7 @@ pub use raw::RawHints;
 pub use sketch::histogram_sketch;
 pub use store::BrickStore;
 
+use format::Format;
 use limit::ByteCap;
 use slabcast_common::volume::Volume;
 use source::{Folder, Inside, Source};
@@ -86,9 +96,9 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// The formats read, as the remedy of an error names them.
-const READS: &str = "give NRRD (.nrrd, .nhdr), NIfTI (.nii, .nii.gz), MetaImage (.mha, .mhd), VTK \
-                     image data (.vti), TIFF pages (.tif) or a folder of them, or raw numbers with \
-                     --dims and --type";
+const READS: &str = "give NRRD, MetaImage, NIfTI or ANALYZE, FreeSurfer (.mgz), MRC (.mrc, .map), NumPy \
+                     (.npy, .npz), VTK image data (.vti, .vtk), TIFF, a folder of pictures, DICOM \
+                     slices or OME-Zarr, or raw numbers with --dims and --type";
 
 /// Hints for opening a volume: what its files do not say, and limits. All are optional.
 #[derive(Clone, Debug, Default)]
@@ -100,6 +110,8 @@ pub struct Hints {
     /// Program and first arguments of the process that parses DICOM by calling `dicom::serve`.
     /// `None` parses in a thread of this process, without limits on memory and time.
     pub dicom_reader: Option<Vec<std::ffi::OsString>>,
+    /// The array to read where a file holds several (`.npz`, `.vtk`), by its name.
+    pub dataset: Option<String>,
     /// Level of a Zarr pyramid, 0 the finest. `None` takes the finest that fits `max_bytes`, or a
     /// quarter of the free memory.
     pub level: Option<u32>,
@@ -113,6 +125,18 @@ pub struct Hints {
 }
 
 impl Hints {
+    /// Refuses a name of an array for files without any.
+    fn check_no_dataset(&self) -> Result<(), Problem> {
+        match self.dataset {
+            None => Ok(()),
+            Some(_) => Err(Problem::malformed(
+                "--dataset",
+                "is for files of several arrays (.npz, .vtk), and this is none",
+                "leave it out",
+            )),
+        }
+    }
+
     fn cap(&self) -> ByteCap {
         ByteCap { asked: self.max_bytes, beside: self.beside.clone() }
     }
@@ -181,6 +205,7 @@ impl From<Volume> for Opened {
 
 fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
     if path.is_dir() {
+        hints.check_no_dataset()?;
         return folder::open(path, hints);
     }
     #[cfg_attr(
@@ -190,6 +215,7 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let mut source = Source { cap: hints.cap(), ..Source::open(path, "file")? };
     #[cfg(feature = "dicom")]
     if dicom::sniff(source.head()?) && hints.raw.dims.is_none() {
+        hints.check_no_dataset()?;
         return folder::open_series_of(path, hints);
     }
     let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -220,10 +246,21 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
     Err(error)
 }
 
-/// Returns the header beside a data file: of the same stem, with the data file's name inside.
+/// Returns the header beside a data file: that of a pair, or one of the same stem with the data file's
+/// name inside.
 fn header_beside(path: &Path) -> Option<PathBuf> {
     let name = path.file_name()?.to_str()?;
     let folder = Folder::open(path.parent()?, "file").ok()?;
+    let pair = nifti::pair::header_names(name).into_iter().find_map(|header| {
+        let Ok(Inside::File(..)) = folder.find(Path::new(&header)) else { return None };
+        let mut source = Source::open(&path.with_file_name(&header), "file").ok()?;
+        let head = source.head().ok()?;
+        let start = if head.starts_with(GZIP) { unpacked(head) } else { head.to_vec() };
+        nifti::pair::sniff(&start).then(|| path.with_file_name(header))
+    });
+    if pair.is_some() {
+        return pair;
+    }
     let stem = name.split('.').next().filter(|stem| !stem.is_empty())?;
     ["mhd", "nhdr"].iter().find_map(|end| {
         let header = path.with_file_name(format!("{stem}.{end}"));
@@ -245,6 +282,7 @@ fn read_noted(
 ) -> Result<Opened, Problem> {
     if tiff_stack::sniff(source.head()?) && hints.raw.dims.is_none() {
         source.pick = hints.pick;
+        hints.check_no_dataset()?;
         return tiff_stack::read(source, name, &hints.raw);
     }
     read(source, folder, name, hints).map(Opened::from)
@@ -263,6 +301,11 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
         hints.pick.choose(&[], "content")?;
         return raw::read(source, gzip, name, &hints.raw);
     }
+    let gzip = head.starts_with(GZIP);
+    if let Some(format) = Format::of(&if gzip { unpacked(head) } else { head.to_vec() }, gzip) {
+        return format.read(source, gzip, folder, name, hints);
+    }
+    hints.check_no_dataset()?;
     let has_header = head.starts_with(nrrd::MAGIC)
         || nifti::sniff(head)
         || metaimage::sniff(head)
@@ -277,10 +320,8 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
     if head.starts_with(nrrd::MAGIC) {
         return nrrd::read(source, folder, name);
     }
-    if head.starts_with(GZIP) {
-        let mut start = Vec::new();
-        // The reader reports an early end or damage.
-        let _ = flate2::read::MultiGzDecoder::new(head).take(4).read_to_end(&mut start);
+    if gzip {
+        let start = unpacked(head);
         if nifti::sniff(&start) {
             return nifti::read(source, true, name);
         }
@@ -294,12 +335,10 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
         if raw::is_described(name, &hints.raw) {
             return raw::read(source, true, name, &hints.raw);
         }
-        return Err(Problem::new(
-            OpenErrorKind::NotAVolume,
-            "content",
-            "is gzip, but not NIfTI",
-            READS,
-        ));
+        return Err(unread::problem(&start, true, name).unwrap_or_else(|| {
+            let what = "is gzip, but not around a volume that we know";
+            Problem::new(OpenErrorKind::NotAVolume, "content", what, READS)
+        }));
     }
     if nifti::sniff(head) {
         return nifti::read(source, false, name);
@@ -314,11 +353,26 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
     if tiff_stack::sniff(head) {
         return tiff_stack::read(source, name, &hints.raw).map(|opened| opened.volume);
     }
-    if raw::is_described(name, &hints.raw) || is_raw(name) {
+    let described = raw::is_described(name, &hints.raw);
+    if !described && let Some(problem) = unread::problem(head, false, name) {
+        return Err(problem);
+    }
+    if described || is_raw(name) {
         return raw::read(source, false, name, &hints.raw);
     }
     Err(Problem::new(OpenErrorKind::NotAVolume, "content", describe(head, name), READS))
 }
+
+/// Returns the first bytes inside gzip, of which `head` are the first.
+fn unpacked(head: &[u8]) -> Vec<u8> {
+    let mut start = Vec::new();
+    // The reader reports an early end or damage.
+    let _ = flate2::read::MultiGzDecoder::new(head).take(START_BYTES).read_to_end(&mut start);
+    start
+}
+
+/// Bytes that tell a format: a header of MRC has 1024.
+const START_BYTES: u64 = 2048;
 
 /// First bytes of a gzip stream.
 const GZIP: &[u8] = &[0x1f, 0x8b];
@@ -331,22 +385,13 @@ fn is_raw(name: &str) -> bool {
 
 /// Describes a file of no readable format, by its first bytes and its name.
 fn describe(head: &[u8], name: &str) -> String {
-    let is = |magic: &[u8]| head.starts_with(magic);
     let ends = |e: &str| name.to_ascii_lowercase().ends_with(e);
-    let what = if is(b"\x89PNG") || is(b"\xff\xd8\xff") || is(b"GIF8") || is(b"BM") {
-        "is a picture, not a volume"
-    } else if head.get(128..132) == Some(b"DICM") || ends(".dcm") {
+    let what = if head.get(128..132) == Some(b"DICM") || ends(".dcm") {
         "is DICOM, which this build does not read (feature `dicom`)"
     } else if ends(".mhd") || ends(".mha") {
         "does not begin with a MetaImage header, so it is damaged or something else"
-    } else if is(b"# vtk") {
-        "is a legacy VTK file; save it as .vti"
-    } else if is(b"<?xml") || ends(".vti") {
+    } else if head.starts_with(b"<?xml") || ends(".vti") {
         "is XML, but not of VTK"
-    } else if is(b"\x89HDF") {
-        "is HDF5, which this version does not read"
-    } else if is(b"BZh") || is(b"PK\x03\x04") || is(b"\x28\xb5\x2f\xfd") || is(b"\xfd7zXZ") {
-        "is packed; unpack it first"
     } else if ends(".nrrd") || ends(".nhdr") {
         "does not begin with `NRRD`, so it is damaged or something else"
     } else if ends(".nii") || ends(".nii.gz") {

@@ -2,7 +2,10 @@
 //!
 //! The header is a C struct, read by a table of offsets; [`Header::parse`] has the tables of both
 //! versions. World axes are RAS+ by definition. The affine is the sform if its code is above zero,
-//! else the qform, else the spacings alone (methods 3, 2 and 1 of nifti1.h), as in nibabel.
+//! else the qform, else the spacings alone (methods 3, 2 and 1 of nifti1.h), as in nibabel. [`pair`]
+//! reads a header and its samples in two files.
+
+pub(crate) mod pair;
 
 use crate::data;
 use crate::error::{OpenErrorKind, Problem};
@@ -11,14 +14,14 @@ use crate::pick::{Axis, Kind, Part, Pick};
 use crate::samples::{self, Endian, Layout, Number, SKIP_MAX_BYTES, Supply};
 use crate::source::{self, Source};
 use glam::{DMat3, DVec3};
-use slabcast_common::volume::{Lattice, ValueMap, Volume};
+use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
 use std::io::Read;
 
 /// Size of a NIfTI-2 header.
 const HEADER_2_BYTES: usize = 540;
 
-/// Returns whether the first bytes, after decompression, are a header: of one file, or of a pair or
-/// ANALYZE, which are then refused by name.
+/// Returns whether the first bytes, after decompression, are a header: of one file, of a pair or of
+/// ANALYZE.
 pub(crate) fn sniff(head: &[u8]) -> bool {
     let Some(size) = head.first_chunk::<4>() else { return false };
     matches!(u32::from_le_bytes(*size), 348 | 540) || matches!(u32::from_be_bytes(*size), 348 | 540)
@@ -68,20 +71,10 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
         Some(part) => data::read_part(reader, supply, part, &layout, cap)?,
         None => samples::read(reader, supply, &layout, cap)?,
     };
-    let map = header.value_map(stored);
     if let Some(rescale) = header.rescale() {
         beside.rescale(rescale);
     }
-    let volume = Volume::new(name, layout.number.name(), anatomical, lattice, samples, map);
-    let (lo, hi) = volume.summary.range();
-    if !(lo.is_finite() && hi.is_finite() && map.scale.is_normal()) {
-        return Err(Problem::malformed(
-            "scl_slope",
-            format!("{:?} takes the values out of the range of numbers", header.slope),
-            "correct scl_slope and scl_inter",
-        ));
-    }
-    Ok(volume)
+    header.volume(name, anatomical, &layout, lattice, samples, stored)
 }
 
 fn fill(reader: &mut dyn Read, bytes: &mut [u8]) -> Result<(), Problem> {
@@ -155,27 +148,25 @@ impl Header {
         let magic = if version_2 { &bytes[4..8] } else { &bytes[344..348] };
         match magic {
             b"n+1\0" | b"n+2\0" => {}
-            b"ni1\0" | b"ni2\0" => {
-                return Err(Problem::unsupported(
-                    "magic",
-                    "is the header of a pair (.hdr with .img)",
-                    "convert it to one .nii or .nii.gz file",
-                ));
-            }
             _ => {
                 return Err(Problem::unsupported(
                     "magic",
                     format!(
-                        "is {}, so this is ANALYZE or damaged",
+                        "is {}, so this is damaged",
                         crate::error::quoted(&String::from_utf8_lossy(magic),)
                     ),
-                    "convert it to NIfTI-1",
+                    "get the file again",
                 ));
             }
         }
+        Ok(Header::fields(bytes, endian))
+    }
+
+    /// Reads the fields, whatever the magic is.
+    fn fields(bytes: &[u8], endian: Endian) -> Header {
         let b = HeaderBytes { bytes, endian };
         use std::array::from_fn;
-        Ok(if version_2 {
+        if bytes.len() == HEADER_2_BYTES {
             Header {
                 dim: from_fn(|i| b.i64(16 + 8 * i)),
                 datatype: b.i16(12),
@@ -206,7 +197,7 @@ impl Header {
                 qoffset: from_fn(|i| f(268 + 4 * i)),
                 srow: from_fn(|r| from_fn(|c| f(280 + 16 * r + 4 * c))),
             }
-        })
+        }
     }
 
     /// Returns the layout of the volume that is read, which part of the samples it is, if not all,
@@ -374,6 +365,29 @@ impl Header {
             DVec3::new(2.0 * (b * c - a * d), a * a + c * c - b * b - d * d, 2.0 * (c * d + a * b)),
             DVec3::new(2.0 * (b * d + a * c), 2.0 * (c * d - a * b), a * a + d * d - c * c - b * b),
         ))
+    }
+
+    /// Returns the volume of these samples, whose codes `stored` maps to numbers.
+    fn volume(
+        &self,
+        name: &str,
+        anatomical: bool,
+        layout: &Layout,
+        lattice: Lattice,
+        samples: Samples,
+        stored: ValueMap,
+    ) -> Result<Volume, Problem> {
+        let map = self.value_map(stored);
+        let volume = Volume::new(name, layout.number.name(), anatomical, lattice, samples, map);
+        let (lo, hi) = volume.summary.range();
+        if !(lo.is_finite() && hi.is_finite() && map.scale.is_normal()) {
+            return Err(Problem::malformed(
+                "scl_slope",
+                format!("{:?} takes the values out of the range of numbers", self.slope),
+                "correct scl_slope and scl_inter",
+            ));
+        }
+        Ok(volume)
     }
 
     /// Returns slope and intercept, if the header has them.

@@ -228,7 +228,7 @@ fn finish(
     name: &str,
     spacing: Option<[f64; 3]>,
 ) -> Result<Volume, Problem> {
-    let Page { width, height, number } = page;
+    let Page { width, height, number, .. } = page;
     let dims = [width.into(), height.into(), count];
     let layout = Layout::new(dims, number, endian, "pages")?;
     let lattice = Lattice::from_spacing(layout.dims, spacing.unwrap_or([1.0; 3]));
@@ -260,6 +260,8 @@ struct Page {
     width: u32,
     height: u32,
     number: Number,
+    /// Bits of a pixel in the file.
+    bits: u32,
 }
 
 impl Page {
@@ -336,6 +338,7 @@ impl TiffFile {
         let format = self.decoder.find_tag_unsigned_vec::<u16>(Tag::SampleFormat);
         let format = format.ok().flatten().and_then(|f| f.first().copied()).unwrap_or(1);
         let number = match (bits, format) {
+            (1 | 2 | 4, 1) => Number::U8,
             (8, 1) => Number::U8,
             (16, 1) => Number::U16,
             (32, 1) => Number::U32,
@@ -350,7 +353,7 @@ impl TiffFile {
                 return Err(Problem::unsupported(
                     "BitsPerSample",
                     format!("{bits} bits of SampleFormat {format} are not read"),
-                    "save it with 8, 16 or 32 bits",
+                    "save it with 1, 2, 4, 8, 16 or 32 bits",
                 ));
             }
         };
@@ -358,6 +361,13 @@ impl TiffFile {
         Layout::new([width.into(), height.into(), 1], number, Endian::Little, "ImageWidth")?;
         let (chunk_width, chunk_height) = self.decoder.chunk_dimensions();
         let tiled = self.decoder.get_chunk_type() == ChunkType::Tile;
+        if tiled && bits < 8 {
+            return Err(Problem::unsupported(
+                "BitsPerSample",
+                format!("{bits} bits in tiles are not read"),
+                "save it with 8 bits, or in strips",
+            ));
+        }
         let rows = u64::from(chunk_height.min(height));
         // A tile is decoded beside its band.
         let tile = if tiled { u64::from(chunk_width) * u64::from(chunk_height) } else { 0 };
@@ -373,7 +383,7 @@ impl TiffFile {
                 "save it with smaller strips or tiles",
             ));
         }
-        Ok(Page { width, height, number })
+        Ok(Page { width, height, number, bits: bits.into() })
     }
 
     /// Decodes the band of a page that starts at `row`, in the machine's byte order, and returns
@@ -391,6 +401,10 @@ impl TiffFile {
             ChunkType::Tile => page.width.div_ceil(chunk_width),
         };
         let first = row / chunk_height * across;
+        if page.bits < 8 {
+            self.check_chunk(first)?;
+            return self.few_bits(page, first, rows, band);
+        }
         if across == 1 && chunk_width >= page.width {
             let index = first;
             self.check_chunk(index)?;
@@ -416,6 +430,29 @@ impl TiffFile {
             self.decoder.read_chunk_bytes(index, &mut tile).map_err(|e| self.tile_problem(&e))?;
             for (row, tile_row) in band.chunks_exact_mut(stride).zip(tile.chunks_exact(w * size)) {
                 row[left..left + w * size].copy_from_slice(tile_row);
+            }
+        }
+        Ok(rows)
+    }
+
+    /// Decodes a strip whose pixels have fewer than 8 bits, the first in the highest ones.
+    fn few_bits(
+        &mut self,
+        page: &Page,
+        index: u32,
+        rows: u32,
+        band: &mut [u8],
+    ) -> Result<u32, Problem> {
+        let (width, bits) = (page.width as usize, page.bits as usize);
+        let stride = (width * bits).div_ceil(8);
+        let mut packed = Vec::new();
+        samples::reserve(&mut packed, stride * rows as usize)?;
+        packed.resize(stride * rows as usize, 0);
+        self.decoder.read_chunk_bytes(index, &mut packed).map_err(|e| self.tile_problem(&e))?;
+        let mask = (1u8 << bits) - 1;
+        for (row, stored) in band.chunks_exact_mut(width).zip(packed.chunks_exact(stride)) {
+            for (x, value) in row.iter_mut().enumerate() {
+                *value = stored[x * bits / 8] >> (8 - bits - x * bits % 8) & mask;
             }
         }
         Ok(rows)
@@ -548,7 +585,7 @@ fn tiff_problem(e: &TiffError) -> Problem {
         TiffError::UnsupportedError(e) => Problem::unsupported(
             "TIFF",
             short(e.to_string()),
-            "save it uncompressed, or with LZW or deflate",
+            "save it in greys, uncompressed or with LZW or deflate, such as `tiffcp -c zip IN OUT`",
         ),
         TiffError::LimitsExceeded => Problem::new(
             OpenErrorKind::TooLarge,

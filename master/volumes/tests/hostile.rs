@@ -29,17 +29,19 @@ fn files_that_are_no_volume_are_refused_with_kind_and_reason() {
         path
     };
     use OpenErrorKind::{Damaged, Malformed, NotAVolume, Unreadable, Unsupported};
+    let empty = dir.path().join("empty");
+    std::fs::create_dir(&empty).unwrap();
     for (path, kind, say) in [
         (dir.path().join("nowhere.nrrd"), Unreadable, "no such file"),
-        (dir.path().to_path_buf(), NotAVolume, "folder: holds no slices or pictures"),
+        (empty, NotAVolume, "folder: holds no slices or pictures"),
         (file("empty.nii", b""), NotAVolume, "is empty"),
-        (file("a.png", b"\x89PNG\r\n\x1a\n0000"), NotAVolume, "is a picture"),
+        (file("a.png", b"\x89PNG\r\n\x1a\n0000"), NotAVolume, "is one PNG picture"),
         (file("a.nrrd", b"hello"), NotAVolume, "does not begin with `NRRD`"),
         (file("a.nii", b"hello"), NotAVolume, "does not begin with a NIfTI header"),
         (file("a.txt", b"some words\n"), NotAVolume, "is text"),
         (file("a.xyz", &[0xee; 99]), NotAVolume, "is not a volume that we know"),
         (file("a.bin", &[0xee; 99]), NotAVolume, "is raw numbers without a header"),
-        (file("a.gz", &[0x1f, 0x8b]), NotAVolume, "is gzip, but not NIfTI"),
+        (file("a.gz", &[0x1f, 0x8b]), NotAVolume, "is gzip, but not around a volume"),
         (file("b.nrrd", b"NRRD0004\n"), Malformed, "type: is missing"),
         (file("c.nrrd", b"NRRD"), Unsupported, "is not NRRD0001"),
         (file("b.nii", &[0x5c, 1, 0, 0, 0, 0]), Damaged, "truncated"),

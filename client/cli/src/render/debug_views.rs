@@ -8,7 +8,7 @@
 use slabcast_common::image::{Picture, PixelFormat};
 use slabcast_common::quality::{Compositing, Quality};
 use slabcast_common::stats::FrameStats;
-use slabcast_render::oracle::work_counters::{WorkCounters, count_work};
+use slabcast_render::oracle::work_counters::{WorkCounters, bands, count_band, join_bands};
 use slabcast_session::canvas::{Canvas, LINE, WHITE, viridis, width};
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
@@ -84,7 +84,11 @@ pub(crate) fn draw(
         let finer = direct::draw(&stage.frame_with(i, half)?, &stage.bricks, Cut::on(threads));
         error(&picture, &estimate(&picture, &finer, quality.compositing))
     } else {
-        let (picture, notes) = count_work(&tables, &stage.bricks);
+        let rows = bands(&tables, threads);
+        let parts = direct::map_parallel(rows.len(), threads, |n, _: &mut ()| {
+            (rows[n], count_band(&tables, &stage.bricks, rows[n]))
+        });
+        let (picture, notes) = join_bands(parts);
         match show {
             DebugView::Depth => depth(&picture, &notes, quality.thickness),
             DebugView::Sheets => {

@@ -8,6 +8,7 @@ use slabcast_common::volume::Digest32;
 use slabcast_master::finish::view_sha256;
 use slabcast_scene::path::{Turntable, ViewPath};
 use slabcast_session::direct::Cut;
+use slabcast_session::figure::Figure;
 use slabcast_session::output::Frame;
 use std::collections::BTreeMap;
 use std::sync::mpsc::sync_channel;
@@ -32,13 +33,14 @@ fn run(tf: &str, edge: u32, frames: u32, folder: &Path) -> Run {
     let mut request = RenderRequest::for_preset(path, tf).expect("a request");
     request.hashed = false;
     let args = OutputArgs {
-        output: folder.to_path_buf(),
+        output: Some(folder.to_path_buf()),
         format: None,
-        fps: 12,
+        fps: None,
         contact_sheet: None,
         force: true,
+        figure: Figure::default(),
     };
-    let looked = Output::look(&args, "frame", request.frames(), request.background, &[]);
+    let looked = Output::look(&args, "frame", &request, &[]);
     Run::bare(request, looked.expect("a folder").0, true)
 }
 
@@ -104,8 +106,8 @@ async fn plain(
         }
         let _ = to.blocking_send(Ok(Update::Done));
     });
-    let done =
-        run.go(Source { updates, cancel: Cancel::none(), framing: None }, "", &info, &recipe).await;
+    let source = Source { updates, cancel: Cancel::none(), framing: None };
+    let done = run.go(source, "", (&info, orientation), &recipe).await;
     for thread in [draw, encode] {
         thread.join().expect("a thread that draws or encodes");
     }

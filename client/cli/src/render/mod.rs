@@ -14,8 +14,8 @@ use debug_views::DebugView;
 use quality::{choose_here, choose_there};
 use run::Run;
 use slabcast_client::{Client, VolumeDescription};
-use slabcast_common::volume::Volume;
-use slabcast_scene::path::Orientation;
+use slabcast_common::volume::{Digest32, Volume};
+use slabcast_scene::path::{MAX_FRAMES, Orientation};
 use slabcast_scene::request::VolumeChoice;
 use slabcast_session::embedded::{self, Cluster, WorkerGroup};
 use slabcast_session::fail::Fail;
@@ -23,13 +23,19 @@ use slabcast_session::output::{DiskWait, Format, Lines, Output, OutputArgs};
 use slabcast_session::path_scenes::PathScenes;
 use slabcast_session::progress::Progress;
 use slabcast_session::record::{self, Recording};
-use slabcast_session::request::{RenderRequest, SceneArgs, WorkArgs};
+use slabcast_session::request::{RenderRequest, SceneArgs, UsualTurn, WorkArgs};
 use slabcast_session::source::{Cancel, Source, Update};
 use slabcast_session::{remote, runtime, signals, volume};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 use tokio::sync::mpsc;
+
+/// Heading of the flags of a view path.
+const VIEW_PATH: &str = "View path (a turn about the volume, unless --path)";
+/// Frames of a turn where nothing says how many: 10 degrees apart in a folder, and a video of 6 s.
+const TURN_FRAMES: u32 = 36;
+const VIDEO_FRAMES: u32 = 180;
 
 const SHORT_EXAMPLES: &str = "\
 Examples, and the flags of raw files, kernels, sums, slabs and tiles: slabcast help render";
@@ -40,17 +46,16 @@ give the same bytes. VOLUME is then a file, which is put on the master unless it
 a volume there (`slabcast volumes`).
 
 Examples:
-  A turn about a head, 18 frames in slabcast-out/:
+  A full turn about a head, 36 frames in slabcast-out/:
       slabcast render brain.nii.gz
   One picture from the front, large, on white:
-      slabcast render brain.nii.gz --azimuth 0 --size 2048x2048 --background white -o front/
-  A full turn in perspective, bones only:
-      slabcast render ct.nrrd --tf bone --frames 72 --projection persp -o turn/
+      slabcast render brain.nii.gz --azimuth 0 --size 2048x2048 --background white -o front.png
+  All six sides in one picture, with names, a scale bar, and 300 dots an inch:
+      slabcast render brain.nii.gz --view all --scale-bar --dpi 300 -o sides.png
+  A movie of ten seconds in perspective, bones only (needs ffmpeg):
+      slabcast render ct.nrrd --tf bone --seconds 10 --projection persp -o turn.mp4
   Where each pixel was shut, how much work it was, how far off it may be:
       slabcast render brain.nii.gz --azimuth 0 --show depth
-  Video, to be encoded by another program:
-      slabcast render brain.nii.gz --frames 72 -o - | ffmpeg -i - -pix_fmt yuv420p \\
-          -colorspace bt709 -color_primaries bt709 -color_trc iec61966-2-1 turn.mp4
   On a cluster (see `slabcast master --help`):
       slabcast render knee.nrrd --master node1:7433 --tf vessels -o out/
 
@@ -85,6 +90,19 @@ pub(crate) struct RenderArgs {
     threads: Option<u32>,
     #[command(flatten)]
     output: OutputArgs,
+    /// Fit --tf to this volume instead, for pictures to be compared
+    #[arg(long, value_name = "VOLUME", help_heading = "Picture", hide_short_help = true)]
+    like: Option<PathBuf>,
+    /// Degrees of a turn, from its first frame on [default: 360]
+    #[arg(long, value_name = "DEG", value_parser = slabcast_session::parse::number,
+          allow_negative_numbers = true, help_heading = VIEW_PATH,
+          conflicts_with_all = ["step", "azimuth", "view", "path"])]
+    turn: Option<f64>,
+    /// Length of a turn in seconds, at --fps
+    #[arg(long, value_name = "S", value_parser = slabcast_session::parse::positive,
+          allow_negative_numbers = true, help_heading = VIEW_PATH,
+          conflicts_with_all = ["frames", "azimuth", "view", "path"])]
+    seconds: Option<f64>,
     /// Draw how pictures come about: depth, owner, work, ...
     ///
     /// depth: where pixels were shut; owner: which worker drew which tile; work; sheets; error: an
@@ -141,8 +159,8 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         }
         if !args.input.is_empty() && !args.volume.as_deref().is_some_and(is_here) {
             return Err(Fail::usage(
-                "--dims, --type and the like say what is in a file, and the master has read the \
-                 volume; leave them out, or give a file",
+                "--dims, --type and the like say what is in a file, and with --master the master has \
+                 read the volume; leave them out, or give a file as VOLUME",
             ));
         }
         for (given, flag) in [(args.workers, "workers"), (args.threads, "threads")] {
@@ -155,7 +173,18 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         }
     }
     let crew = WorkerGroup::new(args.workers.unwrap_or(1), args.threads)?;
-    let mut request = args.scene.request_with_target(args.work.work()?)?;
+    let mut request = args.scene.request_with_turn(args.work.work()?, usual_turn(args)?)?;
+    let mut notes = Vec::new();
+    if let Some(like) = &args.like {
+        let other = volume::open(like)?.info(Digest32::default());
+        let fitted = request.transfer.fitted_to(&other).map_err(|e| request.blame(&e))?;
+        request.transfer = fitted;
+        notes.push(format!(
+            "--tf is fitted to {}; opacities are those of one of its samples' steps, {} long",
+            like.display(),
+            other.lattice.vox()
+        ));
+    }
     request.work.estimate = args.stats.is_some();
     request.hashed = args.stats.is_some() && !args.no_hash;
     if !request.target.is_empty() && args.show.is_some() {
@@ -164,16 +193,15 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             request.target.flags()
         )));
     }
-    let frames = request.frames();
     let stem = args.show.map_or("frame", DebugView::stem);
     let inputs: Vec<&Path> =
         [&args.volume, &args.scene.view.path].into_iter().flatten().map(PathBuf::as_path).collect();
-    let (output, stays) = Output::look(&args.output, stem, frames, request.background, &inputs)?;
+    let (output, stays) = Output::look(&args.output, stem, &request, &inputs)?;
     if output.on_stdout() && args.stats.as_deref() == Some(Path::new("-")) {
         return Err(Fail::usage("--stats: stdout has the frames; give a file"));
     }
     if let Some(show) = args.show {
-        showable(show, args, output.format, &request)?;
+        showable(show, args, &output, &request)?;
     }
     if let Some(path) = &args.record {
         record::check_path(path, &inputs)?;
@@ -193,7 +221,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         output,
         show: args.show,
         patience,
-        notes: stays.into_iter().collect(),
+        notes: notes.into_iter().chain(stays).collect(),
         tell: true,
     };
     let runtime = if master.is_none() { runtime::start_embedded()? } else { runtime::start()? };
@@ -276,6 +304,34 @@ fn served(
     put
 }
 
+/// The turn that is drawn where no flag says it: a full one in a folder, its first picture in a file
+/// of one, and a smooth one in a video.
+fn usual_turn(args: &RenderArgs) -> Result<UsualTurn, Fail> {
+    let asked = args.output.asked()?;
+    let usual = if args.output.is_one_picture()? && args.turn.or(args.seconds).is_none() {
+        1
+    } else if matches!(asked, Some(Format::Mp4 | Format::Webm)) {
+        VIDEO_FRAMES
+    } else {
+        TURN_FRAMES
+    };
+    let frames = match args.seconds {
+        None => usual,
+        Some(seconds) => {
+            let usual = asked.unwrap_or(Format::Y4m).usual_fps();
+            let frames = (seconds * f64::from(args.output.fps.unwrap_or(usual))).round();
+            if !(1.0..=MAX_FRAMES as f64).contains(&frames) {
+                return Err(Fail::usage(format!(
+                    "--seconds: {seconds} seconds are {frames} frames; give a time of 1 to {MAX_FRAMES}"
+                )));
+            }
+            frames as u32
+        }
+    };
+    let degrees = args.turn.unwrap_or(360.0);
+    Ok(UsualTurn { frames, degrees, step: None })
+}
+
 /// Renders the request of a picture's provenance in this process. Prints nothing at the end.
 pub(crate) fn again(
     request: RenderRequest,
@@ -324,7 +380,7 @@ async fn embedded(
     let source = embedded::submit(&handle, &run.request, message).await?;
     let what = format!("{name} by {crew}");
     let result = tokio::select! {
-        result = run.go(source, &what, &info, &recipe) => result,
+        result = run.go(source, &what, (&info, orientation), &recipe) => result,
         trouble = cluster.trouble() => Err(trouble),
     };
     cluster.end().await;
@@ -336,14 +392,19 @@ async fn embedded(
 fn showable(
     show: DebugView,
     args: &RenderArgs,
-    format: Format,
+    output: &Output,
     request: &RenderRequest,
 ) -> Result<(), Fail> {
     if show == DebugView::Error {
         debug_views::can_estimate(&request.quality)?;
     }
-    if matches!(format, Format::Png16 | Format::Exr) {
+    if matches!(output.format, Format::Png16 | Format::Exr) {
         return Err(Fail::usage("--format: what --show draws has 8 bits; give png, apng or y4m"));
+    }
+    if let Some(flag) = output.figure.flag() {
+        return Err(Fail::usage(format!(
+            "--{flag}: what --show draws has a legend of its own; leave one of the two out"
+        )));
     }
     if show == DebugView::Owner {
         return Ok(());
@@ -396,7 +457,8 @@ async fn drawn(
         }
         let _ = to.blocking_send(Ok(Update::Done));
     });
-    run.go(Source { updates, cancel: Cancel::none(), framing }, &what, &info, &recipe).await
+    let source = Source { updates, cancel: Cancel::none(), framing };
+    run.go(source, &what, (&info, orientation), &recipe).await
 }
 
 async fn cluster(
@@ -412,5 +474,5 @@ async fn cluster(
         code = signals::stopped() => return Err(Fail::silent(code)),
     };
     let what = format!("{} on the cluster of {master}", served.name);
-    run.go(source, &what, &served.info, &recipe).await
+    run.go(source, &what, (&served.info, served.orientation), &recipe).await
 }

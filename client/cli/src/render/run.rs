@@ -3,13 +3,15 @@
 use super::debug_views::{self, DebugView};
 use super::frame_check::FrameCheck;
 use super::trace::TraceFile;
+use slabcast_common::view::CameraProjection;
 use slabcast_common::volume::VolumeInfo;
-use slabcast_scene::path::Orientation;
+use slabcast_scene::path::{Orientation, ViewPath};
 use slabcast_scene::presets;
 use slabcast_scene::request::PathRequest;
 use slabcast_session::fail::{Fail, say};
+use slabcast_session::figure::Marker;
 use slabcast_session::output::provenance::RunProvenance;
-use slabcast_session::output::{DiskWait, Format, Frame, Lines, Output, Writer};
+use slabcast_session::output::{DiskWait, Frame, Lines, Output, Writer};
 use slabcast_session::progress::{self, Progress, Step};
 use slabcast_session::request::RenderRequest;
 use slabcast_session::signals;
@@ -39,6 +41,30 @@ pub(super) struct Run {
     pub(super) began: Instant,
     /// Whether the run ends with a line that names the pictures.
     pub(super) tell: bool,
+}
+
+/// Fields of view from which on people lose sight of where the eye is: at 60 degrees it is 0.87 times
+/// the picture's height away from the target.
+const WIDE: f64 = 60.0;
+
+/// Says where the eye is if a wide field of view takes it near to the volume or into it.
+fn where_the_eye_is(path: &ViewPath, info: &VolumeInfo, o: Orientation) -> Option<String> {
+    let lattice = &info.lattice;
+    let camera = path.camera(0, lattice, o).ok()?;
+    let CameraProjection::Persp { fov, distance } = camera.projection else { return None };
+    let eye = camera.target + camera.to_eye.normalize() * distance;
+    let index = lattice.world_from_index().inverse() * eye + lattice.centre_index();
+    let inside = (0..3).all(|a| (-0.5..f64::from(lattice.dims[a]) - 0.5).contains(&index[a]));
+    let unit = if info.summary.anatomical { " mm" } else { "" };
+    let place = format!("--fov {fov}: the eye is {distance:.3}{unit} from the target");
+    if inside {
+        Some(format!(
+            "{place}, inside the volume: nothing behind it is drawn; give a smaller --fov or a larger \
+             --height to stand back"
+        ))
+    } else {
+        (fov > WIDE).then(|| format!("{place}; what is near it looks large"))
+    }
 }
 
 impl Run {
@@ -76,7 +102,10 @@ impl Run {
         signals::listen();
         self.request.fit(info, orientation, anatomical)?;
         let as_what = (self.output.format, self.output.fps());
-        let recipe = RunProvenance::new(&self.request, info, orientation, as_what)?;
+        let figure = &self.output.figure;
+        let recipe = RunProvenance::new(&self.request, info, orientation, as_what, figure)?;
+        // What the marks lack is said before any work.
+        self.marker(recipe.path().clone(), info, orientation)?;
         self.output.make()?;
         if self.tell
             && let Some(name) = self.request.transfer.preset()
@@ -88,14 +117,33 @@ impl Run {
         Ok(recipe)
     }
 
+    /// The marks over the pictures of a path whose numbers are known.
+    fn marker(
+        &self,
+        path: ViewPath,
+        info: &VolumeInfo,
+        orientation: Orientation,
+    ) -> Result<Option<Marker>, Fail> {
+        let Run { request, output, .. } = self;
+        Marker::new(&output.figure, request, path, info, orientation, output.is_grid())
+    }
+
     /// Takes frames until the last one is on disk, Ctrl-C, or trouble.
     pub(super) async fn go(
         self,
         mut source: Source,
         what: &str,
-        info: &VolumeInfo,
+        (info, orientation): (&VolumeInfo, Orientation),
         recipe: &RunProvenance,
     ) -> Result<(), Fail> {
+        let recipe = &recipe.clone().framed(source.framing.as_ref());
+        let marker = self.marker(recipe.path().clone(), info, orientation)?;
+        if self.tell
+            && self.request.path_file.is_none()
+            && let Some(note) = where_the_eye_is(recipe.path(), info, orientation)
+        {
+            progress::note(&note);
+        }
         let Run {
             request,
             output,
@@ -108,13 +156,12 @@ impl Run {
             tell,
             ..
         } = self;
-        let recipe = &recipe.clone().framed(source.framing.as_ref());
         let total = request.path.frames() as u64;
         let [w, h] = request.size();
         let s = if total == 1 { "" } else { "s" };
         progress.frames(total, &format!("rendering {total} frame{s} of {w}x{h} of {what}"));
         let output = Arc::new(output);
-        let mut writer = Writer::new(output.clone(), total, patience.clone())?;
+        let mut writer = Writer::new(output.clone(), total, marker, patience.clone())?;
         let mut trace = TraceFile::new(trace);
         let mut check = FrameCheck::default();
         let (mut first, mut last) = (None, Instant::now());
@@ -153,12 +200,10 @@ impl Run {
                                 writer.put(debug_views::owner(&frame, &facts), None);
                                 continue;
                             }
-                            let made = match output.format {
-                                Format::Apng if begins => Some(recipe.movie(&facts)),
-                                Format::Apng | Format::Y4m => None,
-                                Format::Png | Format::Png16 | Format::Exr => {
-                                    Some(recipe.frame(&facts))
-                                }
+                            let made = if output.is_whole() {
+                                begins.then(|| recipe.movie(&facts))
+                            } else {
+                                output.has_provenance().then(|| recipe.frame(&facts))
                             };
                             writer.put(frame, made);
                         }

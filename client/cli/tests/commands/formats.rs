@@ -28,7 +28,7 @@ fn info(dir: &Path, file: &Path, more: &[&str]) -> serde_json::Value {
 
 /// The hash of one small picture of a file.
 fn picture(dir: &Path, file: &Path, out: &str) -> String {
-    let file = file.to_string_lossy();
+    let (file, out) = (file.to_string_lossy(), &format!("{out}/"));
     let args =
         ["render", &file, "--size", "48x48", "--frames", "1", "-q", "-o", out, "--stats", "-"];
     let line = good(dir, &args);

@@ -13,6 +13,7 @@ mod explain;
 mod formats;
 mod framing;
 mod front;
+mod habits;
 mod help;
 mod manners;
 mod plan;

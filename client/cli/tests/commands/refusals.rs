@@ -141,6 +141,7 @@ fn world() -> tempfile::TempDir {
     put("short.nrrd", &nrrd(16)[..2000]);
     put("empty.nrrd", b"");
     put("text.txt", b"hello\n");
+    put("text", b"hello\n");
     let packed = gzip(&nifti(24));
     put("cut.nii.gz", &packed[..packed.len() / 2]);
     put(
@@ -270,7 +271,7 @@ fn files() -> Vec<(&'static [&'static str], &'static [&'static str])> {
         (&["tf", "bone", "-o", "big.json"], &["big.json", "--force"]),
         (&["tf", "missing.json"], &["missing.json"]),
         (&["render", "good.nrrd", "-o", "full"], &["full", "frame_0000.png", "--force"]),
-        (&["render", "good.nrrd", "-o", "text.txt"], &["text.txt", "-o"]),
+        (&["render", "good.nrrd", "-o", "text"], &["text", "-o"]),
         (&["render", "good.nrrd", "-o", "/proc/slabcast/out"], &["/proc/slabcast"]),
         (&["render", "good.nrrd", "--stats", "nowhere/s.jsonl"], &["nowhere/s.jsonl"]),
         (&["render", "good.nrrd", "--trace", "full"], &["full"]),
@@ -288,7 +289,10 @@ fn files() -> Vec<(&'static [&'static str], &'static [&'static str])> {
         (&["info", "end.mha"], &["end.mha", "ElementDataFile", "LOCAL"]),
         (&["info", "short.mha"], &["short.mha", "16 bytes are needed and 8 are there"]),
         (&["info", "lost.mhd"], &["lost.mhd", "ElementDataFile", "lost.raw"]),
-        (&["info", "channels.mha"], &["channels.mha", "ElementNumberOfChannels", "one channel"]),
+        (
+            &["info", "channels.mha"],
+            &["channels.mha", "ElementNumberOfChannels", "--channel 0 to 2"],
+        ),
         (&["info", "poly.vti"], &["poly.vti", "VTKFile type", "Resample To Image"]),
         (&["info", "extent.vti"], &["extent.vti", "ImageData WholeExtent", "is missing"]),
         (&["info", "word.vti"], &["word.vti", "DataArray `v`", "number 3 is `x`"]),
@@ -327,7 +331,7 @@ fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
     let with = |more: &[&'static str]| [&["render", "good.nrrd"], more].concat();
     vec![
         (vec!["render"], &["VOLUME", "--master"][..]),
-        (vec!["render", "good.nrrd", "--master", "127.0.0.1:1"], &["VOLUME", "--master"]),
+        (vec!["render", "knee", "--master", "127.0.0.1:1", "--skip", "4"], &["--dims", "VOLUME"]),
         (vec!["render", "--master", "127.0.0.1:1", "--workers", "2"], &["--workers"]),
         (vec!["render", "--master", "nowhere:"], &["--master", "HOST:PORT"]),
         (vec!["rendr"], &["rendr", "render"]),
@@ -414,7 +418,7 @@ fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
             &["--listen", "127.0.0.1", "--insecure"],
         ),
         (vec!["master", "--volume", "good.nrrd", "--listen", "7433"], &["--listen", "HOST:PORT"]),
-        (vec!["master"], &["--volume"]),
+        (vec!["master", "--upload-quota", "1"], &["--upload-quota", "16MiB", "0 for none"]),
         (vec!["worker"], &["--master"]),
         (vec!["worker", "--master", "a:1", "--memory", "1"], &["--memory", "512MiB"]),
         (
@@ -435,19 +439,34 @@ fn bad_flags_are_named_with_the_remedy() {
 
 /// Bad places and formats to write to: code, flags of `render`, and what the line names.
 const OUTPUTS: &[(i32, &[&str], &[&str])] = &[
-    (2, &["-o", "a.png"], &["a.png", "18 views", "--azimuth"]),
+    (2, &["-o", "a.png", "--frames", "5"], &["a.png", "5 views", "--azimuth"]),
+    (2, &["-o", "a.pdf"], &["-o: a.pdf", ".png, .tif", "/ for a folder"]),
     (2, &["-o", "a.exr", "--azimuth", "0", "--format", "png"], &["--format", ".png"]),
     (2, &["-o", "a.png", "--azimuth", "0", "--format", "y4m"], &["--format", ".y4m"]),
     (2, &["-o", "out", "--format", "y4m"], &["-o turn.y4m"]),
-    (2, &["-o", "out", "--format", "gif"], &["--format", "apng"]),
-    (2, &["-o", "turn.mp4"], &["-o", "turn.mp4", "ffmpeg"]),
-    (2, &["-o", "a.JPG", "--azimuth", "0"], &["-o", "a.JPG", ".png"]),
+    (2, &["-o", "out", "--format", "gif"], &["-o turn.gif"]),
+    (2, &["-o", "out", "--format", "bmp"], &["--format", "apng"]),
+    (2, &["-o", "a.BMP", "--azimuth", "0"], &["-o", "a.BMP", ".png"]),
+    (2, &["-o", "a.jpg", "--background", "transparent"], &["--background", ".png"]),
+    (2, &["-o", "a.exr", "--caption", "x"], &["--caption", "EXR", "tif"]),
+    (2, &["-o", "a.y4m", "--dpi", "300"], &["--dpi", "leave it out"]),
+    (2, &["-o", "a.png", "--caption", "\u{6f22}"], &["--caption", "no letter"]),
+    (2, &["-o", "a.png", "--orientation"], &["--orientation", "leave it out"]),
+    (2, &["-o", "a.png", "--scale-bar", "--projection", "persp"], &["--scale-bar", "perspective"]),
+    (
+        2,
+        &["-o", "a.exr", "--view", "all", "--up", "+z", "--front", "+y"],
+        &["grid", "png, tif or jpg"],
+    ),
+    (2, &["--seconds", "1e9"], &["--seconds", "100000"]),
+    (2, &["--seconds", "1", "--frames", "3"], &["--seconds", "--frames"]),
+    (2, &["--show", "depth", "--scale-bar"], &["--scale-bar", "--show"]),
     (2, &["-o", "-", "--format", "png"], &["--format", "pipe"]),
     (2, &["-o", "-", "--stats", "-"], &["--stats", "stdout"]),
     (2, &["--no-hash"], &["--stats"]),
     (2, &["-o", "a.y4m", "--background", "transparent"], &["--background", "colour"]),
     (2, &["-o", "a.exr", "--azimuth", "0", "--background", "1,0,0"], &["--background", "EXR"]),
-    (2, &["-o", "good.nrrd", "--format", "y4m"], &["-o", "turn.y4m"]),
+    (2, &["-o", "good.nrrd", "--format", "y4m"], &["-o: good.nrrd", ".y4m"]),
     (2, &["--fps", "0"], &["--fps", "240"]),
     (2, &["--contact-sheet", "all.txt"], &["--contact-sheet", ".png"]),
     (1, &["--contact-sheet", "nowhere/all.png"], &["nowhere/all.png"]),
@@ -482,7 +501,7 @@ const OTHERS: &[(i32, &[&str], &[&str])] = &[
     (2, &["config", "show", "check"], &["check", "render"]),
     (2, &["config", "show", "render", "--sise", "3x3"], &["--sise", "--size"]),
     (2, &["doctor", "--master", "nowhere:"], &["--master", "HOST:PORT"]),
-    (1, &["demo", "-o", "text.txt"], &["text.txt", "-o"]),
+    (1, &["demo", "-o", "text"], &["text", "-o"]),
     (2, &["completions", "tcsh"], &["tcsh", "bash"]),
     (1, &["man", "text.txt"], &["text.txt"]),
 ];
@@ -589,7 +608,10 @@ fn existing_frames_are_not_replaced_without_force() {
     let out = run(dir.path(), &args);
     let stderr = String::from_utf8_lossy(&out.stderr);
     assert!(out.status.success(), "{stderr}");
-    assert!(stderr.contains("frame_0003.png of an earlier run stays"), "{stderr}");
+    assert!(
+        stderr.contains("frame_0003.png of an earlier run, not written by slabcast, stays"),
+        "{stderr}"
+    );
     let png = std::fs::read(dir.path().join("full/frame_0000.png")).unwrap();
     assert!(png.starts_with(b"\x89PNG"));
     let names = tree(&dir.path().join("full"));

@@ -99,7 +99,8 @@ fn rehearsed_frames_are_marked_as_no_pictures() {
     // And what comes of a rehearsal says so, in words, in numbers and to the eye.
     let mut command = worker(&address, &["--rehearse", "s.trace"]);
     let _held = Process(command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap());
-    let render = ["render", "--master", &address, "--size", "128x128", "--frames", "4", "-q"];
+    let render =
+        ["render", "--master", &address, "--size", "128x128", "--frames", "4", "--step", "5", "-q"];
     for schedule in ["slab", "region"] {
         let files = ["--stats", "s.jsonl", "-o", "out", "--schedule", schedule, "--force"];
         let out = run(dir, &[&render[..], &files].concat());

@@ -16,7 +16,7 @@ use slabcast_render::judge::reference::ErrorFigures;
 use slabcast_scene::path::ViewPath;
 use slabcast_session::fail::Fail;
 use slabcast_session::magnify::magnified;
-use slabcast_session::output::{Frame, png};
+use slabcast_session::output::{Frame, Inside, png};
 use slabcast_session::progress::{self, Progress};
 use slabcast_session::request::RenderRequest;
 use slabcast_session::source::{Source, Update};
@@ -165,7 +165,7 @@ fn write(frame: &Frame, times: u32, background: Background) {
     });
     let mut file = Vec::new();
     // Writing into memory can't fail.
-    let _ = png::encode(large.as_ref().unwrap_or(frame), "", &mut file);
+    let _ = png::encode(large.as_ref().unwrap_or(frame), &Inside::default(), &mut file);
     std::hint::black_box(file);
 }
 

@@ -1,8 +1,11 @@
 //! The contact sheet: all frames of a run, small, on one picture.
 
 use super::Frame;
-use crate::canvas::{Canvas, LINE, WHITE};
+use crate::canvas::{Canvas, WHITE};
 use slabcast_common::math::{linear_from_srgb, srgb_from_linear};
+use slabcast_scene::path::ViewPath;
+use std::ops::Range;
+use std::sync::Arc;
 
 /// Most frames on a sheet; of more, every second, third and so on.
 const MOST: u64 = 100;
@@ -11,8 +14,36 @@ const WIDEST: usize = 2048;
 /// Between the pictures.
 const GAP: usize = 6;
 
+/// Size of labels in pixels, and the height of their lines.
+const EM: f64 = 12.0;
+const LINE: usize = 17;
+
+/// Names of the frames of a path, by their number; those from sides of the body have some.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Names(Arc<Vec<Option<&'static str>>>);
+
+impl Names {
+    /// Of a path.
+    pub(crate) fn of(path: &ViewPath) -> Names {
+        let last = path.first_frame() + path.frames();
+        let names = (0..if path.has_sides() { last } else { 0 }).map(|n| path.side_name(n));
+        Names(Arc::new(names.collect()))
+    }
+
+    /// Name of a frame.
+    pub(crate) fn get(&self, number: u64) -> Option<&'static str> {
+        self.0.get(number as usize).copied().flatten()
+    }
+
+    /// Whether all of these frames have one.
+    pub(crate) fn all_of(&self, frames: &Range<u64>) -> bool {
+        frames.clone().all(|n| self.get(n).is_some())
+    }
+}
+
 /// Thumbnails as they come.
 pub(crate) struct Contact {
+    names: Names,
     frames: u64,
     /// Every how manyth frame is shown.
     every: u64,
@@ -24,9 +55,9 @@ pub(crate) struct Contact {
 
 impl Contact {
     /// For so many frames.
-    pub(crate) fn new(frames: u64) -> Self {
+    pub(crate) fn new(frames: u64, names: Names) -> Self {
         let every = frames.div_ceil(MOST).max(1);
-        Contact { frames, every, layout: None, pictures: Vec::new() }
+        Contact { names, frames, every, layout: None, pictures: Vec::new() }
     }
 
     /// Takes a frame.
@@ -42,20 +73,21 @@ impl Contact {
     pub(crate) fn draw(&self) -> Canvas {
         let (columns, [w, h]) = self.layout.unwrap_or((1, [1, 1]));
         let rows = self.pictures.len().div_ceil(columns).max(1);
-        let cell = [w + GAP, h + GAP + LINE + 2];
+        let cell = [w + GAP, h + GAP + LINE];
         let mut canvas = Canvas::new([columns * cell[0] + GAP, rows * cell[1] + GAP]);
         for (i, (number, rgb)) in self.pictures.iter().enumerate() {
             let (row, column) = (i / columns, i % columns);
             let at = [GAP + column * cell[0], GAP + row * cell[1]];
             canvas.put(at, w, rgb);
-            canvas.text([at[0], at[1] + h + 2], 1, &number.to_string(), WHITE);
+            let label = self.names.get(*number).map_or_else(|| number.to_string(), String::from);
+            canvas.label([at[0] as f64 + 1.0, (at[1] + h + LINE - 4) as f64], EM, &label, WHITE);
         }
         canvas
     }
 }
 
 /// Columns for `shown` frames of this size, and a thumbnail's size.
-fn layout(shown: usize, size: [u32; 2]) -> (usize, [usize; 2]) {
+pub(super) fn layout(shown: usize, size: [u32; 2]) -> (usize, [usize; 2]) {
     let [w, h] = size.map(|n| n as usize);
     // About as wide as high, rather wider.
     let columns = (1..=shown).find(|c| c * w * 3 >= shown.div_ceil(*c) * h * 4).unwrap_or(shown);
@@ -114,7 +146,7 @@ mod tests {
             assert!(columns * (w + GAP) <= WIDEST + GAP && h > 0, "{shown} of {size:?}");
         }
         assert_eq!(layout(18, [512, 512]).0, 6);
-        let mut contact = Contact::new(250);
+        let mut contact = Contact::new(250, Names::default());
         for n in 0..250 {
             contact.add(&frame(n, PixelFormat::Rgb8, &[7; 6]));
         }

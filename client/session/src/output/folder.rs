@@ -2,6 +2,7 @@
 
 use super::made::OutputFolder;
 use crate::fail::Fail;
+use std::io::{Read, Seek, SeekFrom};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -14,24 +15,112 @@ pub(crate) struct Folder {
     extension: &'static str,
     /// Digits of a frame's number: at least four, so that names sort.
     digits: usize,
+    /// Frames of an earlier run that the new ones replace although none has their name.
+    stale: Vec<PathBuf>,
     /// Once it was made.
     made: Option<OutputFolder>,
 }
 
+/// Frames that are wanted of a folder.
+#[derive(Clone, Debug)]
+pub(crate) struct Wanted {
+    /// Numbers of the frames.
+    pub(crate) frames: Range<u64>,
+    /// Whether they are a part of a path, whose other frames may be in the folder.
+    pub(crate) part: bool,
+    /// Stem and extension of the file names.
+    pub(crate) names: (&'static str, &'static str),
+}
+
+/// Most folders `slabcast-out-N/` that are looked at.
+const MOST_BESIDE: u32 = 10_000;
+
 impl Folder {
-    /// Looks at the folder and refuses frames that are there, unless `force`. Writes nothing.
-    /// Also says which frames of an earlier run will stay beside the new ones.
+    fn new(path: &Path, wanted: &Wanted) -> Folder {
+        let digits = (wanted.frames.end.saturating_sub(1)).to_string().len().max(4);
+        let (stem, extension) = wanted.names;
+        let (path, stale) = (path.to_path_buf(), Vec::new());
+        Folder { path, stem, extension, digits, stale, made: None }
+    }
+
+    /// Looks at the folder that the user named and refuses frames that are there, unless `force`:
+    /// then they go when the folder is made. Writes nothing.
+    ///
+    /// Frames of the same path that are not wanted now (`--frames 30..60`) stay, which is said.
     pub(crate) fn look(
         path: &Path,
-        (stem, extension): (&'static str, &'static str),
-        frames: Range<u64>,
+        wanted: &Wanted,
         force: bool,
     ) -> Result<(Folder, Option<String>), Fail> {
-        let digits = (frames.end.saturating_sub(1)).to_string().len().max(4);
-        let folder = Folder { path: path.to_path_buf(), stem, extension, digits, made: None };
+        let mut folder = Folder::new(path, wanted);
+        let there = folder.frames_there()?;
+        let (ours, beyond): (Vec<u64>, Vec<u64>) =
+            there.iter().partition(|n| wanted.frames.contains(n));
+        let in_the_way = if wanted.part { &ours } else { &there };
+        if !in_the_way.is_empty() && !force {
+            return Err(Fail::failed(format!(
+                "{}: holds {} already; add --force to replace {}, or give another folder with -o",
+                path.display(),
+                folder.list(in_the_way),
+                if in_the_way.len() == 1 { "it" } else { "them" }
+            )));
+        }
+        let mut stay = beyond;
+        if !wanted.part {
+            let ours = |n: &u64| is_of_slabcast(&folder.file(*n)).unwrap_or(false);
+            let (gone, foreign): (Vec<u64>, Vec<u64>) = stay.into_iter().partition(ours);
+            stay = foreign;
+            folder.stale = gone.iter().map(|&n| folder.file(n)).collect();
+        }
+        let why = if wanted.part { "" } else { ", not written by slabcast," };
+        let note = (!stay.is_empty()).then(|| {
+            format!(
+                "{} of an earlier run{why} {} in {}",
+                folder.list(&stay),
+                if stay.len() == 1 { "stays" } else { "stay" },
+                folder.shown()
+            )
+        });
+        Ok((folder, note))
+    }
+
+    /// Looks at the folder that is taken where the user names none: if it holds frames already,
+    /// `NAME-2`, and so on. Says which. With `force` frames are replaced. Writes nothing.
+    pub(crate) fn look_for_own(
+        path: &Path,
+        wanted: &Wanted,
+        force: bool,
+    ) -> Result<(Folder, Option<String>), Fail> {
+        if force {
+            return Folder::look(path, wanted, true);
+        }
+        let name = path.to_string_lossy().trim_end_matches('/').to_string();
+        let mut held = None;
+        for n in 1..=MOST_BESIDE {
+            let beside = if n == 1 { path.into() } else { PathBuf::from(format!("{name}-{n}")) };
+            let folder = Folder::new(&beside, wanted);
+            let there = folder.frames_there()?;
+            if there.iter().any(|n| !wanted.part || wanted.frames.contains(n)) {
+                held.get_or_insert(folder.shown());
+                continue;
+            }
+            let note = held.map(|held| {
+                let place = folder.shown();
+                format!("{held} holds pictures of an earlier run; these go to {place}")
+            });
+            return Ok((folder, note));
+        }
+        Err(Fail::failed(format!(
+            "{name}-{MOST_BESIDE}: holds pictures, as all before it do; give a folder with -o"
+        )))
+    }
+
+    /// Numbers of the frames in the folder, ascending.
+    fn frames_there(&self) -> Result<Vec<u64>, Fail> {
+        let path = &self.path;
         let entries = match std::fs::read_dir(path) {
             Ok(entries) => entries,
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok((folder, None)),
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
             Err(e) if e.kind() == std::io::ErrorKind::NotADirectory => {
                 return Err(Fail::failed(format!(
                     "{}: is a file; give a folder with -o",
@@ -43,37 +132,27 @@ impl Folder {
         let mut there: Vec<u64> = entries
             .filter_map(|e| {
                 let name = e.ok()?.file_name();
-                let number = name.to_str()?.strip_prefix(stem)?.strip_prefix('_')?;
-                let number = number.strip_suffix(extension)?.strip_suffix('.')?;
-                number.parse().ok().filter(|n| folder.name(*n).as_str() == name)
+                let number = name.to_str()?.strip_prefix(self.stem)?.strip_prefix('_')?;
+                let number = number.strip_suffix(self.extension)?.strip_suffix('.')?;
+                number.parse().ok().filter(|n| self.name(*n).as_str() == name)
             })
             .collect();
         there.sort_unstable();
-        let (ours, beyond): (Vec<u64>, Vec<u64>) =
-            there.into_iter().partition(|n| frames.contains(n));
-        if !ours.is_empty() && !force {
-            return Err(Fail::failed(format!(
-                "{}: holds {} already; add --force to replace {}, or give another folder with -o",
-                path.display(),
-                folder.list(&ours),
-                if ours.len() == 1 { "it" } else { "them" }
-            )));
-        }
-        let stay = (!beyond.is_empty()).then(|| {
-            format!(
-                "{} of an earlier run {} in {}",
-                folder.list(&beyond),
-                if beyond.len() == 1 { "stays" } else { "stay" },
-                folder.shown()
-            )
-        });
-        Ok((folder, stay))
+        Ok(there)
     }
 
-    /// Makes the folder if it is missing, and sees whether files can be made in it: better now
-    /// than after the first frame.
+    /// Makes the folder if it is missing, sees whether files can be made in it (better now than
+    /// after the first frame), and removes stale frames.
     pub(crate) fn make(&mut self) -> Result<(), Fail> {
         self.made = Some(OutputFolder::new(&self.path)?);
+        for file in self.stale.drain(..) {
+            match std::fs::remove_file(&file) {
+                Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                    return Err(Fail::io(&file, "removing", &e));
+                }
+                _ => {}
+            }
+        }
         Ok(())
     }
 
@@ -109,35 +188,110 @@ impl Folder {
     }
 }
 
+/// Returns whether slabcast wrote a picture: the name stands at the beginning of its file, or at the
+/// end of a TIFF.
+fn is_of_slabcast(path: &Path) -> std::io::Result<bool> {
+    const LOOK: u64 = 1 << 16;
+    let mut file = std::fs::File::open(path)?;
+    let long = file.metadata()?.len();
+    for start in [0, long.saturating_sub(LOOK)] {
+        let mut bytes = Vec::new();
+        file.seek(SeekFrom::Start(start))?;
+        Read::by_ref(&mut file).take(LOOK).read_to_end(&mut bytes)?;
+        if bytes.windows(9).any(|w| w == b"slabcast ") {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const PNG: (&str, &str) = ("frame", "png");
+    fn wanted(frames: Range<u64>, part: bool) -> Wanted {
+        Wanted { frames, part, names: ("frame", "png") }
+    }
+
+    /// Files of frames; every second was written by another program.
+    fn fill(dir: &Path, numbers: &[u64]) {
+        std::fs::create_dir_all(dir).unwrap();
+        for (i, n) in numbers.iter().enumerate() {
+            let by: &[u8] = if i % 2 == 0 { b"..slabcast 0.1.0" } else { b"..other" };
+            std::fs::write(dir.join(format!("frame_{n:04}.png")), by).unwrap();
+        }
+    }
 
     #[test]
     fn frames_that_are_there_refuse_before_any_work() {
         let dir = tempfile::tempdir().unwrap();
-        for n in [0, 3, 20] {
-            std::fs::write(dir.path().join(format!("frame_{n:04}.png")), "x").unwrap();
-        }
-        let e = Folder::look(dir.path(), PNG, 0..18, false).unwrap_err();
+        fill(dir.path(), &[0, 3, 20]);
+        let e = Folder::look(dir.path(), &wanted(0..18, true), false).unwrap_err();
         let said = e.line().unwrap();
         assert!(
             said.contains("frame_0000.png ... frame_0003.png (2 of them)")
                 && said.contains("--force"),
             "{said}"
         );
-        let (_, stay) = Folder::look(dir.path(), PNG, 0..18, true).unwrap();
+        let (_, stay) = Folder::look(dir.path(), &wanted(0..18, true), true).unwrap();
         assert!(stay.unwrap().starts_with("frame_0020.png of an earlier run stays"));
-        assert!(Folder::look(dir.path(), ("frame", "exr"), 0..18, false).is_ok());
+        // Pictures of another kind are in nobody's way.
+        let exr = Wanted { names: ("frame", "exr"), ..wanted(0..18, false) };
+        assert!(Folder::look(dir.path(), &exr, false).is_ok());
+        // A whole path that is shorter would be mixed with the rest of the longer one.
+        fill(&dir.path().join("b"), &[7]);
+        assert!(Folder::look(&dir.path().join("b"), &wanted(0..2, false), false).is_err());
+    }
+
+    #[test]
+    fn force_leaves_no_stale_frame_and_takes_nothing_of_others() {
+        let dir = tempfile::tempdir().unwrap();
+        fill(dir.path(), &[0, 4, 5, 6, 7]);
+        std::fs::write(dir.path().join("notes.txt"), "slabcast ").unwrap();
+        std::fs::write(dir.path().join("depth_0009.png"), "slabcast ").unwrap();
+        let (mut folder, note) = Folder::look(dir.path(), &wanted(0..2, false), true).unwrap();
+        assert!(note.unwrap().contains("not written by slabcast, stay"));
+        folder.make().unwrap();
+        let mut names: Vec<_> =
+            std::fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+        names.sort();
+        let want = ["depth_0009.png", "frame_0000.png", "frame_0004.png", "frame_0006.png"];
+        assert_eq!(names[..4], want);
+        assert_eq!(names[4..], ["notes.txt"]);
+    }
+
+    #[test]
+    fn a_folder_of_ones_own_is_continued_beside() {
+        let dir = tempfile::tempdir().unwrap();
+        let own = dir.path().join("out/");
+        let look = |part, force| {
+            let (folder, note) = Folder::look_for_own(&own, &wanted(0..3, part), force).unwrap();
+            (folder.path.file_name().unwrap().to_str().unwrap().to_string(), note)
+        };
+        assert_eq!(look(false, false), ("out".into(), None));
+        // What is no frame is not in the way.
+        std::fs::create_dir(&own).unwrap();
+        std::fs::write(own.join("notes.txt"), "").unwrap();
+        assert_eq!(look(false, false), ("out".into(), None));
+        fill(&own, &[5]);
+        let (name, note) = look(false, false);
+        let note = note.unwrap();
+        assert!(
+            name == "out-2" && note.contains("out/ holds") && note.contains("out-2/"),
+            "{note}"
+        );
+        // Other frames of the same path go beside those that are there.
+        assert_eq!(look(true, false).0, "out");
+        assert_eq!(look(false, true).0, "out");
+        fill(&dir.path().join("out-2"), &[0]);
+        assert_eq!(look(false, false).0, "out-3");
     }
 
     #[test]
     fn a_folder_that_was_made_in_vain_goes_again() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a/b");
-        let (mut folder, _) = Folder::look(&path, PNG, 0..1, false).unwrap();
+        let (mut folder, _) = Folder::look(&path, &wanted(0..1, false), false).unwrap();
         folder.make().unwrap();
         assert!(path.is_dir());
         drop(folder);
@@ -146,8 +300,8 @@ mod tests {
 
     #[test]
     fn names_sort_however_many_there_are() {
-        let (folder, _) =
-            Folder::look(Path::new("nowhere-at-all"), PNG, 0..100_000, false).unwrap();
+        let nowhere = Path::new("nowhere-at-all");
+        let (folder, _) = Folder::look(nowhere, &wanted(0..100_000, false), false).unwrap();
         assert_eq!(folder.name(7), "frame_00007.png");
         assert_eq!(folder.list(&[2]), "frame_00002.png");
     }

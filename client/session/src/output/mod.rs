@@ -6,29 +6,37 @@
 
 mod contact;
 pub mod exr;
+mod ffmpeg;
 mod file;
 mod folder;
+mod format;
+mod grid;
+mod jpg;
 mod lines;
 mod made;
+mod movie;
 pub mod png;
 pub mod provenance;
+mod tif;
 mod y4m;
 
 pub use file::{DiskWait, probe, write_atomic};
+pub use format::{Format, free_name, named};
+pub use grid::Grid;
 pub use lines::Lines;
 pub use made::OutputFolder;
 
 use crate::fail::Fail;
+use crate::figure::{Figure, Marker};
 use crate::magnify::magnified;
 use crate::parse;
-use contact::Contact;
-use file::GrowingFile;
-use folder::Folder;
+use crate::request::RenderRequest;
+use contact::{Contact, Names};
+use folder::{Folder, Wanted};
+use movie::{Movie, Sink};
 use provenance::Provenance;
-use serde::{Deserialize, Serialize};
 use slabcast_common::image::{Background, Picture, PixelFormat};
 use slabcast_common::math::{linear_from_srgb, srgb_from_linear};
-use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use tokio::task::JoinSet;
@@ -77,77 +85,74 @@ impl Frame {
     }
 }
 
-/// File format in which frames are written.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum Format {
-    /// 8-bit PNG
-    Png,
-    /// 16-bit PNG
-    Png16,
-    /// OpenEXR: linear premultiplied floats, no background
-    Exr,
-    /// One moving PNG of all frames
-    Apng,
-    /// One uncompressed video of all frames (YUV4MPEG2), for ffmpeg and others
-    Y4m,
+/// What a picture's file holds beside its pixels.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Inside<'a> {
+    /// Provenance as JSON; nothing is written where it is empty.
+    pub provenance: &'a str,
+    /// Dots an inch on paper, if they were given.
+    pub dpi: Option<u32>,
 }
 
-impl Format {
-    /// Returns the pixel format that a master sends for this file format.
-    pub fn pixels(self, background: Background) -> PixelFormat {
-        match (self, background) {
-            (Format::Png16, _) => PixelFormat::Rgba16,
-            (Format::Exr, _) => PixelFormat::Rgba32F,
-            (Format::Y4m, _) | (_, Background::Colour(_)) => PixelFormat::Rgb8,
-            (_, Background::Transparent) => PixelFormat::Rgba8,
-        }
-    }
+/// Largest edge of a view in a grid: six sides are then 3 by 2 of them, within 12288x8192.
+const GRID_EDGE: u32 = 4096;
 
-    fn extension(self) -> &'static str {
-        match self {
-            Format::Png | Format::Png16 => "png",
-            Format::Exr => "exr",
-            Format::Apng => "apng",
-            Format::Y4m => "y4m",
-        }
-    }
-
-    fn moves(self) -> bool {
-        matches!(self, Format::Apng | Format::Y4m)
-    }
-
-    fn name(self) -> &'static str {
-        if self == Format::Png16 { "png16" } else { self.extension() }
-    }
-}
+/// Folder for frames where the user names none.
+pub const OWN_FOLDER: &str = "slabcast-out/";
 
 /// Target and format of the frames, checked before any work.
 #[derive(clap::Args, Clone, Debug)]
 #[command(next_help_heading = "Output")]
 pub struct OutputArgs {
-    /// Folder for frame_0000.png and so on, or one file
+    /// Folder for frame_0000.png and so on, or one file [default: slabcast-out/]
     ///
-    /// A folder is made if missing. NAME.png or NAME.exr has one frame, NAME.apng or NAME.y4m all
-    /// of them; - writes Y4M video to stdout.
-    #[arg(short, long, value_name = "DIR|FILE|-", default_value = "slabcast-out/")]
-    pub output: PathBuf,
-    /// png, png16, exr, apng or y4m [default: by the name of -o]
+    /// A folder is made if missing; beside a slabcast-out/ with pictures slabcast-out-2/ is, and so on.
+    /// NAME.png, .tif, .jpg or .exr is one picture: the first view, or a grid of the --views. NAME.mp4,
+    /// .webm and .gif (by ffmpeg), .apng or .y4m have all frames; - writes Y4M video to stdout.
+    #[arg(short, long, value_name = "DIR|FILE|-")]
+    pub output: Option<PathBuf>,
+    /// png, png16, exr, tif, jpg, ... [default: by the name of -o]
     ///
-    /// png16 has 16 bits, exr linear floats and no background; apng and y4m are one moving picture.
-    /// A folder gets png by default.
+    /// png, png16, exr, tif, jpg, and moving: apng, y4m, mp4, webm, gif. png16 has 16 bits, exr linear
+    /// floats and no background. A folder gets png by default.
     #[arg(long, value_name = "FORMAT", hide_possible_values = true, value_enum)]
     pub format: Option<Format>,
-    /// Frames a second of a moving picture
-    #[arg(long, value_name = "N", default_value = "12", hide_short_help = true,
+    /// Frames a second of a moving picture [default: 30 of mp4 and webm, else 12]
+    #[arg(long, value_name = "N", hide_short_help = true,
           value_parser = clap::value_parser!(u16).range(1..=240))]
-    pub fps: u16,
+    pub fps: Option<u16>,
     /// Also all frames, small, on one PNG
     #[arg(long, value_name = "FILE.png", value_parser = parse::png, hide_short_help = true)]
     pub contact_sheet: Option<PathBuf>,
     /// Replace files that are there already
+    ///
+    /// Of a folder, all frames that slabcast wrote there before.
     #[arg(long)]
     pub force: bool,
+    /// Marks over the picture.
+    #[command(flatten)]
+    pub figure: Figure,
+}
+
+impl OutputArgs {
+    /// Returns the format that the flags ask for; `None` for a folder without `--format`, a pipe or
+    /// stdout.
+    ///
+    /// # Errors
+    /// The name of `-o` ends in no known format.
+    pub fn asked(&self) -> Result<Option<Format>, Fail> {
+        let named = self.output.as_deref().map_or(Ok(None), named)?;
+        Ok(self.format.or(named))
+    }
+
+    /// Returns whether `-o` names a file for a single picture.
+    ///
+    /// # Errors
+    /// The name of `-o` ends in no known format.
+    pub fn is_one_picture(&self) -> Result<bool, Fail> {
+        let named = self.output.as_deref().map_or(Ok(None), named)?;
+        Ok(named.is_some() && self.asked()?.is_some_and(|f| !f.moves()))
+    }
 }
 
 /// Target of the frames.
@@ -157,6 +162,8 @@ enum Target {
     Folder(Folder),
     /// One frame in one file.
     SingleFrame(PathBuf),
+    /// All frames side by side in one file.
+    Grid(PathBuf),
     /// All frames in one file.
     Movie(PathBuf),
     /// All frames into a pipe; `None` is stdout.
@@ -171,6 +178,11 @@ pub struct Output {
     pub format: Format,
     fps: u16,
     contact: Option<PathBuf>,
+    /// Names of the frames, where they have some.
+    names: Names,
+    /// Marks over the pictures, and their dots an inch.
+    pub figure: Figure,
+    background: Background,
     /// How frames that arrive as small pictures of floats are magnified.
     magnify: Option<Magnify>,
 }
@@ -217,56 +229,50 @@ fn is_pipe(path: &Path) -> bool {
     std::fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir())
 }
 
-/// Refuses names that ask for a format which others write: a folder called `turn.mp4` is a
-/// surprise.
-fn other_programs(path: &Path, ends: &str) -> Result<(), Fail> {
-    const PICTURES: [&str; 9] = ["jpg", "jpeg", "tif", "tiff", "bmp", "gif", "webp", "avif", "ppm"];
-    const VIDEOS: [&str; 7] = ["mp4", "m4v", "mov", "avi", "mkv", "webm", "mpg"];
-    let shown = path.display();
-    if PICTURES.contains(&ends) {
-        return Err(Fail::usage(format!(
-            "-o: {shown}: no {ends} is written; give a folder or a name that ends in .png, .exr or \
-             .apng"
-        )));
+/// Says what becomes of odd edges in a format that has none.
+fn evened(format: Format, [w, h]: [u32; 2]) -> Option<String> {
+    let even = [w, h].map(|n| n.next_multiple_of(2));
+    let odd = matches!(format, Format::Mp4 | Format::Webm) && even != [w, h];
+    odd.then(|| {
+        format!(
+            "video has even edges: {w}x{h} becomes {}x{}, by a line of the background",
+            even[0], even[1]
+        )
+    })
+}
+
+/// Checks that a format can have a background, and the other way round.
+fn fits_background(format: Format, background: Background) -> Result<(), Fail> {
+    match (format, background) {
+        (Format::Jpg, Background::Transparent) => Err(Fail::usage(
+            "--background: a JPEG has no transparency; give a colour, or a name that ends in .png",
+        )),
+        (format, Background::Transparent) if format.moves() && format != Format::Apng => Err(
+            Fail::usage("--background: video has no transparency; give a colour, or --format apng"),
+        ),
+        (Format::Exr, Background::Colour(c)) if c != [0.0; 3] => Err(Fail::usage(
+            "--background: an EXR holds the picture before any background; leave it out",
+        )),
+        _ => Ok(()),
     }
-    if VIDEOS.contains(&ends) {
-        return Err(Fail::usage(format!(
-            "-o: {shown}: no {ends} is written; pipe frames to an encoder: -o - | ffmpeg -i - \
-             {shown}, or give turn.y4m or turn.apng"
-        )));
-    }
-    Ok(())
 }
 
 impl Output {
-    /// Checks the target without writing anything. Also returns a note about files of an
-    /// earlier run that stay beside the new ones.
+    /// Checks the target without writing anything. Also returns a note for the user: about files of
+    /// an earlier run, or a folder beside theirs.
     ///
     /// # Errors
-    /// A file would be replaced without `--force`, or the target doesn't fit the format.
+    /// A file would be replaced without `--force`, the target doesn't fit the format, or ffmpeg is
+    /// needed and missing.
     pub fn look(
         args: &OutputArgs,
         stem: &'static str,
-        frames: std::ops::Range<u64>,
-        background: Background,
+        request: &RenderRequest,
         inputs: &[&Path],
     ) -> Result<(Output, Option<String>), Fail> {
-        let path = &args.output;
+        let path = args.output.as_deref().unwrap_or(Path::new(OWN_FOLDER));
         let shown = path.display();
-        let ends = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
-        // A name with a slash at its end is a folder's, and so is that of a folder.
-        let folder = path.is_dir() || path.to_string_lossy().ends_with('/');
-        let named = match ends.as_deref() {
-            _ if folder => None,
-            Some("png") => Some(Format::Png),
-            Some("exr") => Some(Format::Exr),
-            Some("apng") => Some(Format::Apng),
-            Some("y4m") => Some(Format::Y4m),
-            _ => None,
-        };
-        if let (None, Some(ends), false) = (named, ends.as_deref(), folder) {
-            other_programs(path, ends)?;
-        }
+        let named = named(path)?;
         let stdout = path == Path::new("-");
         let pipe = stdout || is_pipe(path);
         let format = args.format.or(named).unwrap_or(if pipe { Format::Y4m } else { Format::Png });
@@ -277,67 +283,85 @@ impl Output {
                  folder with -o"
             )));
         }
-        let fits = |ends: &str| match format {
-            // A moving PNG is a PNG.
-            Format::Png16 => ends == "png",
-            Format::Apng => ends == "png" || ends == "apng",
-            _ => ends == format.extension(),
-        };
-        if let (Some(_), Some(ends)) = (named, &ends)
-            && !fits(ends)
-        {
+        if named.is_some() && !format::ending(path).is_some_and(|ends| format.fits(&ends)) {
             return Err(Fail::usage(format!(
                 "--format, -o: {shown} is not a name for {name}; end it in .{}",
                 format.extension()
             )));
         }
-        match (format, background) {
-            (Format::Y4m, Background::Transparent) => {
-                return Err(Fail::usage(
-                    "--background: video has no transparency; give a colour, or --format apng",
-                ));
-            }
-            (Format::Exr, Background::Colour(c)) if c != [0.0; 3] => {
-                return Err(Fail::usage(
-                    "--background: an EXR holds the picture before any background; leave it out",
-                ));
-            }
-            _ => {}
-        }
+        let background = request.background;
+        fits_background(format, background)?;
+        args.figure.check(format == Format::Exr, format.has_provenance())?;
         if let Some(contact) = &args.contact_sheet {
             may_write(contact, "contact-sheet", inputs, args.force)?;
         }
-        let mut stays = None;
+        let (mut stays, names) = (None, Names::of(&request.path));
+        let frames = request.frames();
+        let count = frames.end - frames.start;
         let target = if stdout {
             Target::Pipe(None)
         } else if pipe {
-            Target::Pipe(Some(path.clone()))
+            Target::Pipe(Some(path.to_path_buf()))
         } else if format.moves() {
             if named.is_none() {
                 return Err(Fail::usage(format!(
                     "-o: {name} is one file of all frames; give its name, like -o turn.{name}"
                 )));
             }
-            may_write(path, "output", inputs, args.force)?;
-            Target::Movie(path.clone())
-        } else if named.is_some() {
-            if frames.end - frames.start > 1 {
-                let frames = frames.end - frames.start;
-                return Err(Fail::usage(format!(
-                    "-o: {shown} is one picture, and the path has {frames} views; give a folder, \
-                     --azimuth for one view, or turn.apng or turn.y4m for a moving picture"
+            if format.by_ffmpeg() && ffmpeg::program().is_none() {
+                let command = ffmpeg::command_for_people("turn.y4m", path, format);
+                return Err(Fail::failed(format!(
+                    "-o: {shown}: ffmpeg makes {name}, and there is none in PATH; install it, or \
+                     render to -o turn.y4m and run elsewhere: {command}"
                 )));
             }
             may_write(path, "output", inputs, args.force)?;
-            Target::SingleFrame(path.clone())
+            stays = evened(format, request.size()).map(|note| format!("{shown}: {note}"));
+            Target::Movie(path.to_path_buf())
+        } else if named.is_some() {
+            let grid = count > 1 && names.all_of(&frames);
+            if grid && request.size().iter().any(|edge| *edge > GRID_EDGE) {
+                return Err(Fail::usage(format!(
+                    "--size: each view of a grid has at most {GRID_EDGE}x{GRID_EDGE} pixels"
+                )));
+            }
+            if grid && !matches!(format, Format::Png | Format::Tif | Format::Jpg) {
+                return Err(Fail::usage(format!(
+                    "-o: a grid of views has 8 bits, as png, tif or jpg; give one of them, or a \
+                     folder for a {name} of each view"
+                )));
+            }
+            if count > 1 && !grid {
+                return Err(Fail::usage(format!(
+                    "-o: {shown} is one picture, and the path has {count} views; give a folder, \
+                     --azimuth or --frames N..N for one view, or turn.mp4 or turn.apng for a moving \
+                     picture"
+                )));
+            }
+            may_write(path, "output", inputs, args.force)?;
+            let path = path.to_path_buf();
+            if grid { Target::Grid(path) } else { Target::SingleFrame(path) }
         } else {
-            let names = (stem, format.extension());
-            let (folder, beside) = Folder::look(path, names, frames, args.force)?;
-            stays = beside;
+            let part = request.path.range.is_some();
+            let wanted = Wanted { frames, part, names: (stem, format.extension()) };
+            let (folder, note) = match args.output {
+                Some(_) => Folder::look(path, &wanted, args.force),
+                None => Folder::look_for_own(path, &wanted, args.force),
+            }?;
+            stays = note;
             Target::Folder(folder)
         };
-        let contact = args.contact_sheet.clone();
-        Ok((Output { target, format, fps: args.fps, contact, magnify: None }, stays))
+        let output = Output {
+            target,
+            format,
+            fps: args.fps.unwrap_or(format.usual_fps()),
+            contact: args.contact_sheet.clone(),
+            names,
+            figure: args.figure.clone(),
+            background,
+            magnify: None,
+        };
+        Ok((output, stays))
     }
 
     /// Sets the factor by which frames are magnified and returns the pixel format to ask the
@@ -354,6 +378,21 @@ impl Output {
         let format = self.format.pixels(background);
         let bytes = large.encode(format, background).into();
         Frame { number: frame.number, size: large.size, format, bytes }
+    }
+
+    /// Returns whether frames become one still picture.
+    pub fn is_grid(&self) -> bool {
+        matches!(self.target, Target::Grid(_))
+    }
+
+    /// Returns whether one file has all frames and one provenance.
+    pub fn is_whole(&self) -> bool {
+        self.format == Format::Apng || self.is_grid()
+    }
+
+    /// Returns whether the format has a place for provenance.
+    pub fn has_provenance(&self) -> bool {
+        self.format.has_provenance()
     }
 
     /// Returns the frames a second of a moving picture.
@@ -390,93 +429,21 @@ impl Output {
     pub fn shown(&self, written: &[u64]) -> String {
         match &self.target {
             Target::Folder(folder) => format!("{} ({})", folder.shown(), folder.list(written)),
-            Target::SingleFrame(path) | Target::Movie(path) | Target::Pipe(Some(path)) => {
-                path.display().to_string()
-            }
+            Target::SingleFrame(path)
+            | Target::Grid(path)
+            | Target::Movie(path)
+            | Target::Pipe(Some(path)) => path.display().to_string(),
             Target::Pipe(None) => "stdout".into(),
         }
-    }
-}
-
-/// A moving picture in the making.
-struct Movie {
-    coder: Coder,
-    sink: Sink,
-    frames: u64,
-}
-
-enum Coder {
-    Apng(png::Moving),
-    Y4m { fps: u16 },
-}
-
-enum Sink {
-    /// Not begun: the file is made with the first frame, so that a run that fails before has
-    /// nothing to clean up.
-    New(PathBuf),
-    File(GrowingFile),
-    Pipe(Box<dyn Write + Send>, String),
-}
-
-impl Movie {
-    fn add(&mut self, frame: &Frame, provenance: &str, patience: &DiskWait) -> std::io::Result<()> {
-        let piece = match &mut self.coder {
-            Coder::Apng(moving) => moving.frame(frame, provenance)?,
-            Coder::Y4m { fps } => {
-                let mut piece = Vec::new();
-                if self.frames == 0 {
-                    piece = y4m::head(frame.size, *fps);
-                }
-                piece.extend(y4m::frame(frame)?);
-                piece
-            }
-        };
-        if let Sink::New(path) = &self.sink {
-            self.sink = Sink::File(patience.until_taken(path, || GrowingFile::new(path))?);
-        }
-        match &mut self.sink {
-            Sink::New(_) => unreachable!("begun above"),
-            Sink::File(file) => file.add(&piece, patience)?,
-            Sink::Pipe(pipe, _) => {
-                pipe.write_all(&piece)?;
-                pipe.flush()?;
-            }
-        }
-        self.frames += 1;
-        Ok(())
-    }
-
-    /// Ends it with as many frames as there are; none leave nothing.
-    fn end(self, patience: &DiskWait) -> std::io::Result<()> {
-        let Sink::File(mut file) = self.sink else { return Ok(()) };
-        if let Coder::Apng(moving) = &self.coder {
-            let (tail, (at, patch)) = moving.end();
-            file.add(&tail, patience)?;
-            file.patch(at, &patch)?;
-        }
-        file.settle(patience)
-    }
-
-    fn path(&self) -> String {
-        match &self.sink {
-            Sink::New(path) => path.display().to_string(),
-            Sink::File(file) => file.path().display().to_string(),
-            Sink::Pipe(_, name) => name.clone(),
-        }
-    }
-
-    fn fail(name: &str, e: &std::io::Error) -> Fail {
-        if e.kind() == ErrorKind::BrokenPipe {
-            return Fail::failed(format!("{name}: whoever read the frames has gone away"));
-        }
-        Fail::io(Path::new(name), "writing", e)
     }
 }
 
 /// Writes frames, encoded on blocking threads of the runtime.
 pub struct Writer {
     output: Arc<Output>,
+    marker: Option<Arc<Marker>>,
     movie: Option<Arc<Mutex<Movie>>>,
+    grid: Option<Arc<Mutex<Grid>>>,
     contact: Option<Arc<Mutex<Contact>>>,
     patience: Arc<DiskWait>,
     busy: JoinSet<Result<u64, Fail>>,
@@ -489,17 +456,18 @@ pub struct Writer {
 const AT_ONCE: usize = 2;
 
 impl Writer {
-    /// Starts writing `frames` frames; opens pipes.
+    /// Starts writing `frames` frames, each with the marks of `marker`; opens pipes.
     ///
     /// # Errors
     /// The pipe can't be opened.
-    pub fn new(output: Arc<Output>, frames: u64, patience: Arc<DiskWait>) -> Result<Self, Fail> {
-        let coder = || match output.format {
-            Format::Apng => Coder::Apng(png::Moving::new(output.fps)),
-            _ => Coder::Y4m { fps: output.fps },
-        };
+    pub fn new(
+        output: Arc<Output>,
+        frames: u64,
+        marker: Option<Marker>,
+        patience: Arc<DiskWait>,
+    ) -> Result<Self, Fail> {
         let sink = match &output.target {
-            Target::Folder(_) | Target::SingleFrame(_) => None,
+            Target::Folder(_) | Target::SingleFrame(_) | Target::Grid(_) => None,
             Target::Movie(path) => Some(Sink::New(path.clone())),
             Target::Pipe(None) => Some(Sink::Pipe(Box::new(std::io::stdout()), "stdout".into())),
             Target::Pipe(Some(path)) => {
@@ -508,16 +476,24 @@ impl Writer {
                 Some(Sink::Pipe(Box::new(pipe), path.display().to_string()))
             }
         };
-        let movie =
-            sink.map(|sink| Arc::new(Mutex::new(Movie { coder: coder(), sink, frames: 0 })));
-        let contact = output.contact.as_ref().map(|_| Arc::new(Mutex::new(Contact::new(frames))));
-        Ok(Writer { output, movie, contact, patience, busy: JoinSet::new(), written: Vec::new() })
+        let behind = ffmpeg::bytes_of(output.background);
+        let movie = sink
+            .map(|sink| Arc::new(Mutex::new(Movie::new(sink, output.format, output.fps, behind))));
+        let contact = output
+            .contact
+            .as_ref()
+            .map(|_| Arc::new(Mutex::new(Contact::new(frames, output.names.clone()))));
+        let is_grid = matches!(output.target, Target::Grid(_));
+        let grid = is_grid.then(|| Arc::new(Mutex::new(Grid::new(None, behind))));
+        let (busy, written) = (JoinSet::new(), Vec::new());
+        let marker = marker.map(Arc::new);
+        Ok(Writer { output, marker, movie, grid, contact, patience, busy, written })
     }
 
     /// Returns whether [`Writer::put`] may be called.
     pub fn has_room(&self) -> bool {
         // Frames of a moving picture follow each other.
-        self.busy.len() < if self.movie.is_some() { 1 } else { AT_ONCE }
+        self.busy.len() < if self.movie.is_some() || self.grid.is_some() { 1 } else { AT_ONCE }
     }
 
     /// Returns whether a frame is being written.
@@ -527,29 +503,41 @@ impl Writer {
 
     /// Takes the next frame in order, with its provenance.
     pub fn put(&mut self, frame: Frame, made: Option<Provenance>) {
-        let (output, movie) = (self.output.clone(), self.movie.clone());
+        let (output, movie, grid) = (self.output.clone(), self.movie.clone(), self.grid.clone());
         let (contact, patience) = (self.contact.clone(), self.patience.clone());
+        let marker = self.marker.clone();
         self.busy.spawn_blocking(move || {
-            let frame = output.full(frame);
+            let mut frame = output.full(frame);
+            if let Some(marker) = marker {
+                frame.bytes = marker
+                    .draw(frame.number, frame.size, frame.format, frame.bytes.to_vec())
+                    .into();
+            }
             let provenance = made.map_or_else(String::new, |made| made.written(&frame));
             if let Some(contact) = contact {
                 contact.lock().expect("no thread panics with it").add(&frame);
             }
-            let to = |path: &Path| {
-                patience.write_atomic(path, |out| match output.format {
-                    Format::Exr => exr::encode(&frame, &provenance, out),
-                    _ => png::encode(&frame, &provenance, out),
-                })
-            };
-            match (&output.target, movie) {
-                (Target::Folder(folder), _) => to(&folder.file(frame.number))?,
-                (Target::SingleFrame(path), _) => to(path)?,
-                (_, Some(movie)) => {
+            let inside = Inside { provenance: &provenance, dpi: output.figure.dpi };
+            match (&output.target, movie, grid) {
+                (Target::Folder(folder), ..) => {
+                    write(&folder.file(frame.number), &frame, &inside, output.format, &patience)?;
+                }
+                (Target::SingleFrame(path), ..) => {
+                    write(path, &frame, &inside, output.format, &patience)?;
+                }
+                (_, Some(movie), _) => {
                     let mut movie = movie.lock().expect("no thread panics with it");
-                    let added = movie.add(&frame, &provenance, &patience);
+                    let added = movie.add(&frame, &inside, &patience);
                     added.map_err(|e| Movie::fail(&movie.path(), &e))?;
                 }
-                (_, None) => unreachable!("made with the writer"),
+                (_, _, Some(grid)) => {
+                    let number = frame.number;
+                    let mut grid = grid.lock().expect("no thread panics with it");
+                    grid.made(provenance);
+                    grid.add(frame, output.names.get(number).unwrap_or_default());
+                    return Ok(number);
+                }
+                _ => unreachable!("made with the writer"),
             }
             Ok(frame.number)
         });
@@ -600,12 +588,19 @@ impl Writer {
             return first;
         }
         let (movie, contact) = (self.movie.take(), self.contact.take());
+        let (grid, marker) = (self.grid.take(), self.marker.clone());
         let (output, patience) = (self.output.clone(), self.patience.clone());
         let ended = tokio::task::spawn_blocking(move || {
             if let Some(movie) = movie.and_then(Arc::into_inner) {
                 let movie = movie.into_inner().expect("no thread panics with it");
                 let name = movie.path();
                 movie.end(&patience).map_err(|e| Movie::fail(&name, &e))?;
+            }
+            if let (Some(grid), Target::Grid(path)) = (grid, &output.target) {
+                let mut grid = grid.lock().expect("no thread panics with it");
+                let (frame, provenance) = grid.draw(marker.as_deref());
+                let inside = Inside { provenance: &provenance, dpi: output.figure.dpi };
+                write(path, &frame, &inside, output.format, &patience)?;
             }
             if let (Some(contact), Some(path)) = (contact, &output.contact) {
                 let sheet = contact.lock().expect("no thread panics with it").draw();
@@ -628,24 +623,62 @@ impl Writer {
     }
 }
 
+/// Writes one picture that has no provenance: whole or not there.
+///
+/// # Errors
+/// The file can't be written.
+pub fn write_picture(
+    path: &Path,
+    frame: &Frame,
+    dpi: Option<u32>,
+    format: Format,
+) -> Result<(), Fail> {
+    write(path, frame, &Inside { provenance: "", dpi }, format, &DiskWait::default())
+}
+
+/// Returns a background as sRGB bytes; black where there is none.
+pub fn background_bytes(background: Background) -> [u8; 3] {
+    ffmpeg::bytes_of(background)
+}
+
+/// Writes one picture: whole or not there.
+fn write(
+    path: &Path,
+    frame: &Frame,
+    inside: &Inside<'_>,
+    format: Format,
+    patience: &DiskWait,
+) -> Result<(), Fail> {
+    patience.write_atomic(path, |out| match format {
+        Format::Exr => exr::encode(frame, inside.provenance, out),
+        Format::Tif => tif::encode(frame, inside, out),
+        Format::Jpg => jpg::encode(frame, inside, out),
+        _ => png::encode(frame, inside, out),
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use slabcast_scene::path::{Turntable, ViewPath};
 
     /// A frame of two pixels side by side.
     pub(super) fn frame(number: u64, format: PixelFormat, bytes: &[u8]) -> Frame {
         Frame { number, size: [2, 1], format, bytes: bytes.to_vec().into() }
     }
 
-    fn look(output: &str, format: Option<Format>, frames: u64) -> Result<Output, String> {
+    fn look(output: &str, format: Option<Format>, frames: u32) -> Result<Output, String> {
         let args = OutputArgs {
-            output: output.into(),
+            output: Some(output.into()),
             format,
-            fps: 12,
+            fps: None,
             contact_sheet: None,
             force: false,
+            figure: Figure::default(),
         };
-        Output::look(&args, "frame", 0..frames, Background::Colour([0.0; 3]), &[])
+        let path = ViewPath::from_turntable([8, 8], Turntable { frames, ..Turntable::default() });
+        let request = RenderRequest::for_preset(path, "skin").unwrap();
+        Output::look(&args, "frame", &request, &[])
             .map(|(output, _)| output)
             .map_err(|e| e.line().unwrap_or_default().to_string())
     }
@@ -665,6 +698,8 @@ mod tests {
             ("a.png", Some(Format::Png16), 1, Format::Png16, "a.png"),
             ("a.png", Some(Format::Apng), 9, Format::Apng, "a.png"),
             ("a.exr", None, 1, Format::Exr, "a.exr"),
+            ("a.jpeg", None, 1, Format::Jpg, "a.jpeg"),
+            ("a.tif", None, 1, Format::Tif, "a.tif"),
             ("a.y4m", None, 9, Format::Y4m, "a.y4m"),
             ("-", None, 9, Format::Y4m, "stdout"),
         ] {
@@ -675,6 +710,7 @@ mod tests {
             ("a.png", None, 2, "--azimuth"),
             ("a.png", Some(Format::Exr), 1, ".exr"),
             ("a.exr", Some(Format::Y4m), 1, ".y4m"),
+            ("a.pdf", None, 1, "no .pdf is written; end the name in .png, .tif"),
             ("out", Some(Format::Y4m), 1, "-o turn.y4m"),
             ("-", Some(Format::Png), 1, "--format"),
             ("/dev/null", Some(Format::Apng), 1, "--format"),

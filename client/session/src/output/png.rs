@@ -4,7 +4,7 @@
 //! number of frames first and holds the caller to it: a run that is stopped half-way has fewer,
 //! and what is done is kept. Any viewer that knows no APNG shows its first frame.
 
-use super::Frame;
+use super::{Frame, Inside};
 use crate::software::{SOFTWARE, io_error};
 use slabcast_common::image::PixelFormat;
 use std::io::{Error, Result, Write};
@@ -14,11 +14,12 @@ pub const KEYWORD: &str = "slabcast";
 /// Longer provenances (a transfer function of many points) are compressed.
 const PLAIN: usize = 2048;
 
-/// Encodes a frame as a PNG, with `provenance` as text unless it is empty.
+/// Encodes a frame as a PNG, with its provenance as text unless that is empty.
 ///
 /// # Errors
 /// `out` can't be written.
-pub fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> Result<()> {
+pub fn encode(frame: &Frame, inside: &Inside<'_>, out: &mut impl Write) -> Result<()> {
+    let Inside { provenance, dpi } = *inside;
     let mut png = png::Encoder::new(out, frame.size[0], frame.size[1]);
     let (colour, depth, bytes) = match frame.format {
         PixelFormat::Rgb8 => (png::ColorType::Rgb, png::BitDepth::Eight, None),
@@ -42,6 +43,12 @@ pub fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> Result<(
     // better one (Balanced) takes 23 ms and 2.7 s, for files a fifth to a third smaller: longer
     // than rendering on a good machine.
     png.set_compression(png::Compression::Fast);
+    if let Some(dpi) = dpi {
+        // The chunk counts pixels a metre.
+        let per_metre = (f64::from(dpi) / 0.0254).round() as u32;
+        let [xppu, yppu] = [per_metre; 2];
+        png.set_pixel_dims(Some(png::PixelDimensions { xppu, yppu, unit: png::Unit::Meter }));
+    }
     png.add_text_chunk("Software".into(), SOFTWARE.into()).map_err(io_error)?;
     match provenance.len() {
         0 => Ok(()),
@@ -88,10 +95,11 @@ impl Moving {
     }
 
     /// The bytes that a frame adds; the first brings the head.
-    pub(super) fn frame(&mut self, frame: &Frame, provenance: &str) -> Result<Vec<u8>> {
+    pub(super) fn frame(&mut self, frame: &Frame, inside: &Inside<'_>) -> Result<Vec<u8>> {
         let first = self.frames == 0;
         let mut still = Vec::new();
-        encode(frame, if first { provenance } else { "" }, &mut still)?;
+        let later = Inside { provenance: "", ..*inside };
+        encode(frame, if first { inside } else { &later }, &mut still)?;
         let mut out = Vec::with_capacity(still.len() + 64);
         if first {
             out.extend_from_slice(&still[..8]);
@@ -195,13 +203,15 @@ mod tests {
             for long in [10, 5000] {
                 let said = format!("{{\"x\":\"{}\"}}", "y".repeat(long));
                 let mut png = Vec::new();
-                encode(&frame(0, format, &bytes), &said, &mut png).unwrap();
+                let inside = Inside { provenance: &said, dpi: Some(300) };
+                encode(&frame(0, format, &bytes), &inside, &mut png).unwrap();
                 assert_eq!(provenance(&png).unwrap().as_deref(), Some(&*said));
                 let mut reader = png::Decoder::new(std::io::Cursor::new(&png)).read_info().unwrap();
                 let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
                 reader.next_frame(&mut pixels).unwrap();
                 assert_eq!(pixels, want);
                 assert!(reader.info().srgb.is_some());
+                assert_eq!(reader.info().pixel_dims.map(|d| d.xppu), Some(11811));
             }
         }
     }
@@ -213,7 +223,8 @@ mod tests {
             let mut all = Vec::new();
             for n in 0..count {
                 let bytes = [n; 6];
-                let piece = moving.frame(&frame(n.into(), PixelFormat::Rgb8, &bytes), "{}");
+                let inside = Inside { provenance: "{}", dpi: None };
+                let piece = moving.frame(&frame(n.into(), PixelFormat::Rgb8, &bytes), &inside);
                 all.extend(piece.unwrap());
             }
             let (tail, (at, patch)) = moving.end();

@@ -4,8 +4,9 @@
 //! Nothing in it says who, where or when: a picture of a patient that is passed on tells the
 //! volume's digest and no name, and the same picture made elsewhere has the same bytes.
 
-use super::{Format, Frame, exr, png};
+use super::{Format, Frame, exr, jpg, png, tif};
 use crate::fail::Fail;
+use crate::figure::Figure;
 use crate::request::RenderRequest;
 use crate::transfer::Transfer;
 use serde::{Deserialize, Serialize};
@@ -51,6 +52,9 @@ pub struct Provenance {
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub magnify: u32,
     background: Ground,
+    /// Marks drawn over the picture, and its dots an inch.
+    #[serde(default, skip_serializing_if = "Figure::is_empty")]
+    pub figure: Figure,
     /// File format of the picture.
     pub format: Format,
     /// Frames a second of a moving picture.
@@ -121,7 +125,7 @@ impl Provenance {
         hashes(self) == hashes(other)
     }
 
-    /// Returns the provenance in the bytes of a PNG or EXR; `path` is for messages.
+    /// Returns the provenance in the bytes of a picture; `path` is for messages.
     ///
     /// # Errors
     /// The picture has none, is damaged, or is of another version.
@@ -131,8 +135,15 @@ impl Provenance {
             png::provenance(bytes)
         } else if bytes.starts_with(b"\x76\x2f\x31\x01") {
             exr::provenance(bytes)
+        } else if bytes.starts_with(b"\xff\xd8") {
+            jpg::provenance(bytes)
+        } else if bytes.starts_with(b"II*\0") || bytes.starts_with(b"MM\0*") {
+            tif::provenance(bytes)
         } else {
-            return Err(Fail::failed(format!("{file}: is neither a PNG nor an EXR")));
+            return Err(Fail::failed(format!(
+                "{file}: is neither a PNG nor an EXR, TIFF or JPEG; videos and GIFs do not say what \
+                 made them"
+            )));
         };
         let text = text
             .map_err(|e| Fail::failed(format!("{file}: {e}; the file is damaged")))?
@@ -162,6 +173,7 @@ impl Provenance {
         p.path.check().map_err(refused)?;
         p.transfer.check().map_err(refused)?;
         p.quality.check().map_err(refused)?;
+        p.figure.check(p.format == Format::Exr, p.format.has_provenance())?;
         let fits = |edge: u32| edge.checked_mul(p.magnify).is_some_and(|n| n <= MAX_EDGE);
         if p.magnify == 0 || !p.path.size.into_iter().all(fits) {
             return Err(Fail::failed(format!(
@@ -211,6 +223,7 @@ impl RunProvenance {
         info: &VolumeInfo,
         orientation: Orientation,
         (format, fps): (Format, Option<u16>),
+        figure: &Figure,
     ) -> Result<RunProvenance, Fail> {
         // A field that is new must be thought about here: does it decide pixels?
         let PathRequest {
@@ -260,6 +273,7 @@ impl RunProvenance {
                     Background::Transparent => Ground::Word("transparent".into()),
                     Background::Colour(c) => Ground::Colour(c),
                 },
+                figure: figure.clone(),
                 format,
                 fps,
                 view_sha256: None,
@@ -280,6 +294,11 @@ impl RunProvenance {
         // Nothing was there to be fitted to, or all was given.
         self.base.path.fit = Fit::Volume;
         self
+    }
+
+    /// Returns the path with the numbers of its framing.
+    pub fn path(&self) -> &ViewPath {
+        &self.base.path
     }
 
     /// Returns the provenance of the single frame of these statistics.

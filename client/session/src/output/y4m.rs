@@ -13,7 +13,7 @@
 //! each rounded to nearest. 4:4:4, because what is thrown away here nobody gets back, and one
 //! option of the encoder (`-pix_fmt yuv420p`) throws it away as well; BT.709, because sRGB has its
 //! primaries and players assume it for anything large. The format has no field for the matrix, so
-//! whoever encodes says it: README.md has the command. Limited range is what encoders take 8-bit
+//! whoever encodes says it ([`super::ffmpeg`], docs/how-to/movie-for-a-slide.md). Limited range is what encoders take 8-bit
 //! video for; the header says it, too.
 
 use super::Frame;

@@ -7,9 +7,9 @@ use super::{KeepArgs, RenderRequest};
 use crate::fail::Fail;
 use crate::parse::{self, Frames, Tile};
 use crate::quality_target::QualityTarget;
-use crate::transfer::{Transfer, TransferFlags, read_json};
+use crate::transfer::{NameOrFile, Transfer, TransferFlags, read_json};
 use crate::volume::InputArgs;
-use clap::builder::{PossibleValuesParser, TypedValueParser, ValueParser};
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser, ValueParser};
 use slabcast_common::image::Background;
 use slabcast_common::quality::{
     Borders, Classify, Compositing, Kernel, Quality, Schedule, Splat, Sums, Work,
@@ -26,6 +26,72 @@ fn words<T: Copy + Send + Sync + 'static>(list: &'static [(&'static str, T)]) ->
     ValueParser::new(names.map(move |word: String| {
         list.iter().find(|(name, _)| *name == word).expect("clap lets only these through").1
     }))
+}
+
+/// Sides of the body that the user wants to see it from, in their order.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Sides(Vec<Side>);
+
+/// Parses `--view`: names with commas between, or `all`.
+#[derive(Clone)]
+struct SidesParser;
+
+impl TypedValueParser for SidesParser {
+    type Value = Sides;
+
+    fn parse_ref(
+        &self,
+        command: &clap::Command,
+        arg: Option<&clap::Arg>,
+        value: &std::ffi::OsStr,
+    ) -> Result<Sides, clap::Error> {
+        let known = Side::NAMES.map(|(name, _)| name);
+        let one = PossibleValuesParser::new(known.iter().copied().chain(["all"]));
+        let mut sides = Vec::new();
+        for word in value.to_string_lossy().split(',') {
+            let name = one.parse_ref(command, arg, word.trim().as_ref())?;
+            let found = Side::NAMES.iter().find(|(known, _)| *known == name).map(|(_, side)| side);
+            sides.extend(found.map_or(Side::NAMES.map(|(_, side)| side).to_vec(), |s| vec![*s]));
+        }
+        Ok(Sides(sides))
+    }
+
+    /// For completions.
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        let names = Side::NAMES.iter().map(|(name, _)| *name).chain(["all"]);
+        Some(Box::new(names.map(PossibleValue::new)))
+    }
+}
+
+/// The turn that `--frames`, `--step` and the like leave open.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct UsualTurn {
+    /// Number of frames.
+    pub frames: u32,
+    /// Degrees from the first frame to where the next after the last would be. A number of frames
+    /// without `--step` divides them.
+    pub degrees: f64,
+    /// Degrees from frame to frame, however many there are; `None` divides `degrees`.
+    pub step: Option<f64>,
+}
+
+impl UsualTurn {
+    /// A full turn of as many frames.
+    pub const fn full(frames: u32) -> UsualTurn {
+        UsualTurn { frames, degrees: 360.0, step: None }
+    }
+
+    /// The turn of measurements: neighbours share most of what they need, as in a movie.
+    pub const LAB: UsualTurn = UsualTurn { frames: 18, degrees: 90.0, step: Some(5.0) };
+
+    /// Degrees from frame to frame.
+    fn step(&self, frames: Frames) -> f64 {
+        let count = match frames {
+            Frames::Count(n) if n > 1 => n,
+            _ => self.frames.max(36),
+        };
+        self.step.unwrap_or(self.degrees / f64::from(count))
+    }
 }
 
 /// `--up` and `--front`.
@@ -69,27 +135,28 @@ pub struct ViewArgs {
     #[arg(long, value_name = "DEG", default_value = "20", value_parser = parse::number,
           allow_negative_numbers = true)]
     start: f64,
-    /// Degrees from frame to frame
-    #[arg(long, value_name = "DEG", default_value = "5", value_parser = parse::number,
-          allow_negative_numbers = true)]
-    step: f64,
-    /// Number of frames, or a range of a path [default: 18]
+    /// Degrees from frame to frame [default: a full turn; lab: 5]
+    #[arg(long, value_name = "DEG", value_parser = parse::number, allow_negative_numbers = true)]
+    step: Option<f64>,
+    /// Number of frames, or a range of a path [default: 36; lab: 18]
     ///
-    /// Of a path the default is all; 30..60 draws frames 30 to 60, which keep their numbers.
+    /// Of a path the default is all; 30..60 draws frames 30 to 60, which keep their numbers. One
+    /// picture (-o front.png) is the first frame; a video (mp4, webm) has 180.
     #[arg(long, value_name = "N|A..B", value_parser = parse::frames)]
     frames: Option<Frames>,
     /// One frame at this azimuth
     #[arg(long, value_name = "DEG", value_parser = parse::number, allow_negative_numbers = true,
           conflicts_with_all = ["start", "step", "frames"])]
     azimuth: Option<f64>,
-    /// One frame from a side: anterior, left, superior, ...
+    /// One frame from a side (anterior, left, superior, ...), several, or all
     ///
-    /// anterior, left, superior, posterior, right or inferior. Where the file has no anatomical
-    /// axes, --front is anterior and --up superior.
-    #[arg(long, value_name = "SIDE", value_parser = words(&Side::NAMES),
+    /// anterior, left, superior, posterior, right, inferior; several with commas between, or all. In
+    /// one picture (-o sides.png) several are a grid with their names. Where the file has no
+    /// anatomical axes, --front is anterior and --up superior.
+    #[arg(long, value_name = "SIDE,...|all", value_parser = SidesParser,
           hide_possible_values = true,
           conflicts_with_all = ["start", "step", "frames", "azimuth", "elevation"])]
-    view: Option<Side>,
+    view: Option<Sides>,
     /// Degrees towards up, -90 to 90
     #[arg(long, value_name = "DEG", default_value = "0", value_parser = parse::number,
           allow_negative_numbers = true)]
@@ -143,7 +210,8 @@ pub struct PictureArgs {
     /// A preset (auto, skin, bone, vessels, ...), a colour map (viridis, ...) or a JSON file, ours
     /// or ParaView's. `slabcast tf --list` has all names, `slabcast info VOLUME` shows what each
     /// preset would draw.
-    #[arg(long, value_name = "NAME|FILE", default_value = "auto")]
+    #[arg(long, value_name = "NAME|FILE", default_value = "auto", hide_possible_values = true,
+          value_parser = NameOrFile::TRANSFER)]
     tf: String,
     #[command(flatten)]
     transfer: TransferFlags,
@@ -285,7 +353,7 @@ impl SceneArgs {
     fn request_in(&self, usual: Classify, work: Work) -> Result<RenderRequest, Fail> {
         let target = &self.quality.target;
         if target.is_empty() {
-            return self.any_request(usual, work);
+            return self.any_request(usual, work, UsualTurn::LAB);
         }
         Err(Fail::usage(format!(
             "{}: this command compares qualities that are given; leave it out (render, lab bench \
@@ -300,16 +368,30 @@ impl SceneArgs {
     /// # Errors
     /// A flag or file is wrong in itself.
     pub fn request_with_target(&self, work: Work) -> Result<RenderRequest, Fail> {
-        self.any_request(Classify::After, work)
+        self.any_request(Classify::After, work, UsualTurn::LAB)
     }
 
-    fn any_request(&self, usual: Classify, work: Work) -> Result<RenderRequest, Fail> {
+    /// Returns the request of a command that makes pictures for people; `turn` is what it draws where
+    /// no flag says it.
+    ///
+    /// # Errors
+    /// A flag or file is wrong in itself.
+    pub fn request_with_turn(&self, work: Work, turn: UsualTurn) -> Result<RenderRequest, Fail> {
+        self.any_request(Classify::After, work, turn)
+    }
+
+    fn any_request(
+        &self,
+        usual: Classify,
+        work: Work,
+        turn: UsualTurn,
+    ) -> Result<RenderRequest, Fail> {
         let SceneArgs { view, picture, quality: flags } = self;
         let quality = flags.quality(usual)?;
         view.axes.orientation()?;
         let mut path = match &view.path {
             Some(file) => view.path_from_file(file, picture)?,
-            None => view.path_from_flags(picture.size.unwrap_or([512, 512]))?,
+            None => view.path_from_flags(picture.size.unwrap_or([512, 512]), turn)?,
         };
         path.crop = view.crop.or(path.crop);
         let usual = match (&view.path, view.height) {
@@ -479,7 +561,7 @@ impl ViewArgs {
     }
 
     /// Returns the turntable or single view of the flags.
-    fn path_from_flags(&self, size: [u32; 2]) -> Result<ViewPath, Fail> {
+    fn path_from_flags(&self, size: [u32; 2], turn: UsualTurn) -> Result<ViewPath, Fail> {
         let persp = self.projection == ProjectionKind::Persp;
         if self.fov.is_some() && !persp {
             return Err(Fail::usage(
@@ -487,27 +569,28 @@ impl ViewArgs {
             ));
         }
         let fov = self.fov.unwrap_or(30.0);
-        if let Some(side) = self.view {
-            let key = Key {
-                view: Some(side),
+        if let Some(Sides(sides)) = &self.view {
+            let key = |side: &Side| Key {
+                view: Some(*side),
                 projection: self.projection,
                 height: self.height,
                 fov: persp.then_some(fov),
                 ..Key::default()
             };
-            let one = KeyFrames {
-                frames: 1,
+            let all = KeyFrames {
+                frames: sides.len() as u32,
                 easing: Default::default(),
                 up: self.axes.up,
                 front: self.axes.front,
-                keys: vec![key],
+                keys: sides.iter().map(key).collect(),
             };
-            return Ok(ViewPath { keyframes: Some(one), ..ViewPath::from_views(size, Vec::new()) });
+            return Ok(ViewPath { keyframes: Some(all), ..ViewPath::from_views(size, Vec::new()) });
         }
         let (start, frames) = match (self.azimuth, self.frames) {
             (Some(azimuth), _) => (azimuth, Frames::Count(1)),
-            (None, frames) => (self.start, frames.unwrap_or(Frames::Count(18))),
+            (None, frames) => (self.start, frames.unwrap_or(Frames::Count(turn.frames))),
         };
+        let step = self.step.unwrap_or_else(|| turn.step(frames));
         // A turn has no last frame: a range of it is a range of one that is long enough.
         let (frames, range) = match frames {
             Frames::Count(n) => (n, None),
@@ -515,7 +598,7 @@ impl ViewArgs {
         };
         let turntable = Turntable {
             start,
-            step: self.step,
+            step,
             frames,
             elevation: self.elevation,
             target: None,

@@ -8,7 +8,7 @@ mod flags;
 mod keep;
 
 pub use flags::{
-    AxisArgs, OpenedVolume, PictureArgs, QualityArgs, SceneArgs, ThreadArgs, ViewArgs,
+    AxisArgs, OpenedVolume, PictureArgs, QualityArgs, SceneArgs, ThreadArgs, UsualTurn, ViewArgs,
     VolumeSceneArgs, WorkArgs,
 };
 pub use keep::KeepArgs;
@@ -128,6 +128,9 @@ impl RenderRequest {
         for i in 0..self.path.frames() {
             let camera = cameras.camera(i).map_err(blame)?;
             View::new(&info.lattice, &camera, self.path.size, &self.quality).map_err(|mut e| {
+                if let Some(fail) = self.stretched(&e, info) {
+                    return fail;
+                }
                 // A view speaks of itself; a path has many.
                 let n = self.path.first_frame() + i;
                 if e.field != "size" && self.path_file.is_some() {
@@ -143,6 +146,27 @@ impl RenderRequest {
             })?;
         }
         Ok(())
+    }
+
+    /// Returns the refusal of a volume whose samples lie so unevenly that no camera fits it; `None`
+    /// where a camera that the user gave is to blame.
+    fn stretched(&self, refused: &InvalidField, info: &VolumeInfo) -> Option<Fail> {
+        let spacing = info.lattice.spacing();
+        let small = spacing.into_iter().fold(f64::INFINITY, f64::min);
+        let large = spacing.into_iter().fold(0.0, f64::max);
+        let given =
+            self.path.turntable.is_none_or(|t| t.height.or(t.target.map(|_| 0.0)).is_some())
+                && !self.path.wants_framing();
+        if large < 1000.0 * small
+            || given
+            || !["target", "eye", "height"].contains(&&*refused.field)
+        {
+            return None;
+        }
+        Some(Fail::failed(format!(
+            "spacing: samples are {small:e} apart along one axis and {large:e} along another, and \
+             sheets are as thin as the smaller; correct the spacing, or resample the volume"
+        )))
     }
 
     /// Returns a refusal that names where the user wrote what is refused: a flag, or a field of a

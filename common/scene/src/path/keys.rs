@@ -204,6 +204,16 @@ impl KeyFrames {
         })
     }
 
+    /// Returns the key that a frame of this number is exactly at.
+    pub(super) fn key_at(&self, number: usize) -> Option<&Key> {
+        let (wanted, mut first, mut end) = (number as f64, 0, self.keys.len());
+        while first < end {
+            let middle = (first + end) / 2;
+            if self.time(middle) < wanted { first = middle + 1 } else { end = middle }
+        }
+        self.keys.get(first).filter(|_| self.time(first) == wanted)
+    }
+
     /// Makes all cameras ready.
     ///
     /// # Errors

@@ -364,6 +364,18 @@ impl ViewPath {
         self.range.map_or(0, |[first, _]| first as usize)
     }
 
+    /// Returns whether frames of the path may be views from sides of the body.
+    pub fn has_sides(&self) -> bool {
+        self.keyframes.as_ref().is_some_and(|k| k.keys.iter().any(|key| key.view.is_some()))
+    }
+
+    /// Returns the name of the side of the body that a frame is seen from, by its number on the whole
+    /// path; `None` for frames between keys and from elsewhere.
+    pub fn side_name(&self, number: usize) -> Option<&'static str> {
+        let side = self.keyframes.as_ref()?.key_at(number)?.view?;
+        Side::NAMES.iter().find(|(_, s)| *s == side).map(|(name, _)| *name)
+    }
+
     /// Returns the path of one frame alone, by its number on the whole path: the same view, to the
     /// bit.
     ///

@@ -5,6 +5,7 @@
 //! a file of 323 bytes, and depends on a crate with an advisory (`encoding`, unmaintained). A
 //! volume needs twenty elements, all short and in ASCII, and the position of the pixels.
 
+use super::frames::{Groups, PER_FRAME, SHARED};
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::samples::Endian;
 use crate::source::Source;
@@ -16,7 +17,7 @@ use std::io::{BufRead, Read};
 pub(super) type Tag = (u16, u16);
 
 /// Elements whose values are kept, with their names.
-pub(super) const KEPT: [(Tag, &str); 26] = [
+pub(super) const KEPT: [(Tag, &str); 28] = [
     ((0x0002, 0x0010), "TransferSyntaxUID"),
     ((0x0008, 0x0008), "ImageType"),
     ((0x0008, 0x0060), "Modality"),
@@ -42,11 +43,15 @@ pub(super) const KEPT: [(Tag, &str); 26] = [
     ((0x0028, 0x1052), "RescaleIntercept"),
     ((0x0028, 0x1053), "RescaleSlope"),
     ((0x0028, 0x3000), "ModalityLUTSequence"),
+    ((0x3004, 0x000c), "GridFrameOffsetVector"),
+    ((0x3004, 0x000e), "DoseGridScaling"),
     ((0x7fe0, 0x0010), "PixelData"),
 ];
 
 /// Longest value that is kept; six numbers of 16 characters take 101 bytes.
-const VALUE_MAX_BYTES: u32 = 1024;
+pub(super) const VALUE_MAX_BYTES: u32 = 1024;
+/// Longest GridFrameOffsetVector: 16 characters for each of 4096 frames, the most of 16 bits of length.
+const OFFSETS_MAX_BYTES: u32 = 1 << 16;
 /// Most bytes before the pixels: private elements can hold whole reports.
 const HEADER_MAX_BYTES: u64 = 64 << 20;
 /// Most elements of a file, since empty ones take few bytes.
@@ -54,7 +59,7 @@ const ELEMENTS_MAX: u32 = 1 << 20;
 /// Deepest nesting of sequences.
 const DEPTH_MAX: u32 = 64;
 /// Length of an element that a delimiter ends.
-const UNDEFINED: u32 = u32::MAX;
+pub(super) const UNDEFINED: u32 = u32::MAX;
 
 /// How pixels are stored.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -66,17 +71,30 @@ pub(super) enum Pixels {
         /// Whether they are words of 16 bits (VR OW), whose bytes the byte order turns.
         words: bool,
     },
-    /// Run-length encoded, in fragments.
+    /// Encoded, in fragments.
+    Packed(Packing),
+}
+
+/// How pixels in fragments are encoded.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Packing {
+    /// Run lengths.
     Rle,
+    Jpeg,
+    JpegLs,
 }
 
 /// A file read up to its pixels.
 pub(super) struct File {
-    values: BTreeMap<Tag, Vec<u8>>,
+    pub(super) values: BTreeMap<Tag, Vec<u8>>,
     pub(super) endian: Endian,
     pub(super) pixels: Pixels,
     /// Reader at the first byte of the pixels.
     pub(super) rest: Box<dyn BufRead>,
+    /// What is said of each of several frames.
+    pub(super) groups: Groups,
+    /// Place of the pixels, or of the first item of fragments; `None` inside deflate.
+    pub(super) pixels_at: Option<u64>,
 }
 
 /// Returns whether the first bytes are DICOM: with the preamble of 128 bytes and `DICM`, or
@@ -88,18 +106,19 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// How elements are encoded: with or without their types, and in which byte order.
 #[derive(Clone, Copy)]
-struct Syntax {
+pub(super) struct Syntax {
     explicit: bool,
     endian: Endian,
 }
 
 /// Position in the elements of a file, with the counts that are limited.
-struct ElementReader {
+pub(super) struct ElementReader {
     inner: Box<dyn BufRead>,
     /// Bytes read or skipped so far.
-    consumed_bytes: u64,
+    pub(super) consumed_bytes: u64,
     /// Elements read so far.
     elements: u32,
+    pub(super) groups: Groups,
 }
 
 impl File {
@@ -107,11 +126,15 @@ impl File {
     pub(super) fn open(mut source: Source) -> Result<File, Problem> {
         let part10 = source.head()?.get(128..132) == Some(b"DICM");
         let len = source.len;
-        let mut reader =
-            ElementReader { inner: Box::new(source.reader), consumed_bytes: 0, elements: 0 };
+        let mut reader = ElementReader {
+            inner: Box::new(source.reader),
+            consumed_bytes: 0,
+            elements: 0,
+            groups: Groups::default(),
+        };
         let mut values = BTreeMap::new();
         let mut syntax = Syntax { explicit: false, endian: Endian::Little };
-        let (mut rle, mut deflated) = (false, false);
+        let (mut packing, mut deflated) = (None, false);
         if part10 {
             reader.skip(132)?;
             let meta = Syntax { explicit: true, endian: Endian::Little };
@@ -120,18 +143,24 @@ impl File {
                 reader.element(meta, &mut values, len)?;
             }
             let uid = values.get(&(0x0002, 0x0010)).map(|v| text(v)).unwrap_or_default();
-            (syntax, rle, deflated) = match uid.as_str() {
-                "1.2.840.10008.1.2" | "" => (syntax, false, false),
-                "1.2.840.10008.1.2.1" => (meta, false, false),
-                "1.2.840.10008.1.2.1.99" => (meta, false, true),
+            (syntax, packing, deflated) = match uid.as_str() {
+                "1.2.840.10008.1.2" | "" => (syntax, None, false),
+                "1.2.840.10008.1.2.1" => (meta, None, false),
+                "1.2.840.10008.1.2.1.99" => (meta, None, true),
                 "1.2.840.10008.1.2.2" => {
-                    (Syntax { explicit: true, endian: Endian::Big }, false, false)
+                    (Syntax { explicit: true, endian: Endian::Big }, None, false)
                 }
-                "1.2.840.10008.1.2.5" => (meta, true, false),
+                "1.2.840.10008.1.2.5" => (meta, Some(Packing::Rle), false),
+                "1.2.840.10008.1.2.4.50"
+                | "1.2.840.10008.1.2.4.51"
+                | "1.2.840.10008.1.2.4.57"
+                | "1.2.840.10008.1.2.4.70" => (meta, Some(Packing::Jpeg), false),
+                "1.2.840.10008.1.2.4.80" | "1.2.840.10008.1.2.4.81" => {
+                    (meta, Some(Packing::JpegLs), false)
+                }
                 other => {
                     let name = match other.strip_prefix("1.2.840.10008.1.2.4.") {
-                        Some("50" | "51" | "57" | "70") => "JPEG",
-                        Some("80" | "81") => "JPEG-LS",
+                        Some("52" | "53" | "54" | "55" | "56") => "JPEG of a kind that is not used",
                         Some("90" | "91" | "92" | "93" | "201" | "202" | "203") => "JPEG 2000",
                         Some("100" | "101" | "102" | "103" | "104" | "105" | "106") => "video",
                         _ => "not an encoding that is known",
@@ -170,9 +199,9 @@ impl File {
                 break pixels;
             }
         };
-        let pixels = match (rle, bytes) {
-            (true, UNDEFINED) => Pixels::Rle,
-            (false, n) if n != UNDEFINED => {
+        let pixels = match (packing, bytes) {
+            (Some(packing), UNDEFINED) => Pixels::Packed(packing),
+            (None, n) if n != UNDEFINED => {
                 let left = len.saturating_sub(reader.consumed_bytes);
                 if u64::from(n) > left {
                     return Err(crate::samples::truncated(n.into(), left));
@@ -187,7 +216,9 @@ impl File {
                 ));
             }
         };
-        Ok(File { values, endian: syntax.endian, pixels, rest: reader.inner })
+        let pixels_at = (!deflated).then_some(reader.consumed_bytes);
+        let ElementReader { inner: rest, groups, .. } = reader;
+        Ok(File { values, endian: syntax.endian, pixels, rest, groups, pixels_at })
     }
 
     /// Returns a kept value as trimmed text; `None` if it is absent or empty.
@@ -269,7 +300,7 @@ impl ElementReader {
         Ok([chunk.first().copied().unwrap_or(0), chunk.get(1).copied().unwrap_or(0)])
     }
 
-    fn skip(&mut self, bytes: u64) -> Result<(), Problem> {
+    pub(super) fn skip(&mut self, bytes: u64) -> Result<(), Problem> {
         self.consumed_bytes = self.consumed_bytes.saturating_add(bytes);
         if self.consumed_bytes > HEADER_MAX_BYTES {
             return Err(malformed(format!("take more than {HEADER_MAX_BYTES} bytes")));
@@ -298,7 +329,7 @@ impl ElementReader {
     }
 
     /// Reads tag and length of the next element, and whether it has the type OW.
-    fn head(&mut self, s: Syntax) -> Result<(Tag, u32, bool), Problem> {
+    pub(super) fn head(&mut self, s: Syntax) -> Result<(Tag, u32, bool), Problem> {
         self.elements += 1;
         if self.elements > ELEMENTS_MAX {
             return Err(malformed(format!("are more than {ELEMENTS_MAX}")));
@@ -351,6 +382,10 @@ impl ElementReader {
             // That it is there is enough.
             values.insert(tag, b"1".to_vec());
         }
+        if tag == SHARED || tag == PER_FRAME {
+            self.groups(s, bytes, tag)?;
+            return Ok(None);
+        }
         if bytes == UNDEFINED {
             self.skip_undefined(s, 1)?;
             return Ok(None);
@@ -358,11 +393,10 @@ impl ElementReader {
         if u64::from(bytes) > len.saturating_sub(self.consumed_bytes) {
             return Err(broken(&std::io::ErrorKind::UnexpectedEof.into()));
         }
+        let most = if tag == (0x3004, 0x000c) { OFFSETS_MAX_BYTES } else { VALUE_MAX_BYTES };
         let sequence = tag == (0x0028, 0x3000);
-        if KEPT.iter().any(|(kept, _)| *kept == tag) && bytes <= VALUE_MAX_BYTES && !sequence {
-            let mut value = vec![0; bytes as usize];
-            self.inner.read_exact(&mut value).map_err(|e| broken(&e))?;
-            self.consumed_bytes += u64::from(bytes);
+        if KEPT.iter().any(|(kept, _)| *kept == tag) && bytes <= most && !sequence {
+            let value = self.value(bytes)?;
             values.insert(tag, value);
         } else {
             self.skip(bytes.into())?;
@@ -370,8 +404,16 @@ impl ElementReader {
         Ok(None)
     }
 
+    /// Reads a value of a few bytes.
+    pub(super) fn value(&mut self, bytes: u32) -> Result<Vec<u8>, Problem> {
+        let mut value = vec![0; bytes as usize];
+        self.inner.read_exact(&mut value).map_err(|e| broken(&e))?;
+        self.consumed_bytes += u64::from(bytes);
+        Ok(value)
+    }
+
     /// Skips a sequence or item of undefined length, up to its delimiter.
-    fn skip_undefined(&mut self, s: Syntax, depth: u32) -> Result<(), Problem> {
+    pub(super) fn skip_undefined(&mut self, s: Syntax, depth: u32) -> Result<(), Problem> {
         if depth > DEPTH_MAX {
             return Err(malformed(format!("stand in more than {DEPTH_MAX} sequences")));
         }

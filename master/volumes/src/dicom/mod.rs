@@ -7,12 +7,20 @@
 
 mod confine;
 mod elements;
+mod fragments;
+mod frames;
+mod jpeg;
+mod jpeg_ls;
 mod rle;
 mod series;
 mod watch;
 mod wire;
 
 pub(crate) use elements::sniff;
+#[cfg(test)]
+pub(crate) use frames::tests::enhanced;
+#[cfg(test)]
+pub(crate) use jpeg_ls::tests::{encoded_pictures, one_jpeg_ls};
 #[cfg(test)]
 pub(crate) use series::one_slice;
 
@@ -35,8 +43,9 @@ use wire::Preface;
 /// a network disk, and more than a process that only waits.
 const BYTES_A_SECOND: u64 = 4 << 20;
 
-/// Most bytes of samples per byte of a file: two bytes of RLE decode to at most 128.
-const RLE_RATIO: u64 = 64;
+/// Most bytes of samples per byte of a file: a row of 2048 numbers of 16 bits takes a bit in JPEG-LS, and
+/// a file has a header.
+const PACKED_RATIO: u64 = 8192;
 
 /// Opens one series of these files, which are all DICOM and in `folder`. The hints name it, the
 /// command that parses, and the limit; `file` is a slice of it.
@@ -143,8 +152,8 @@ fn read_volume(
         preface;
     let layout = Layout::new(lattice.dims.map(u64::from), number, Endian::Little, "slices")?;
     lattice.check().map_err(|e| Problem::malformed("slices", e, "get the series again"))?;
-    let supply = Supply::Encoded { name: "DICOM", bytes, ratio: RLE_RATIO };
     let beside = cap.beside.clone();
+    let supply = Supply::Encoded { name: "DICOM", bytes, ratio: PACKED_RATIO };
     let (samples, stored) = samples::read(pipe, supply, &layout, cap).map_err(|mut p| {
         p.field = "slices".into();
         p

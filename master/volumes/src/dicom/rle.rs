@@ -12,34 +12,7 @@ fn fragments_max_bytes(bytes: usize) -> u64 {
 /// Decodes a picture of `pixels` pixels of `size` bytes each, to little-endian numbers.
 pub(super) fn unpack(rest: &mut dyn Read, pixels: usize, size: usize) -> Result<Vec<u8>, Problem> {
     let bad = |what: &str| Problem::malformed("PixelData", what, "get the file again");
-    let io = |_| bad("is truncated inside its RLE fragments");
-    let mut head = [0; 8];
-    let mut fragment = Vec::new();
-    // The first item is a table of offsets, skipped; the picture may span several fragments.
-    let mut items = 0;
-    loop {
-        rest.read_exact(&mut head).map_err(io)?;
-        let len = u32::from_le_bytes([head[4], head[5], head[6], head[7]]);
-        match (head[..4] == [0xfe, 0xff, 0x00, 0xe0], head[..4] == [0xfe, 0xff, 0xdd, 0xe0]) {
-            (true, _)
-                if fragment.len() as u64 + u64::from(len) > fragments_max_bytes(pixels * size) =>
-            {
-                return Err(bad("has RLE fragments that are too long for the picture"));
-            }
-            (true, _) => {
-                let before = fragment.len();
-                let target = if items == 0 { &mut Vec::new() } else { &mut fragment };
-                rest.take(len.into()).read_to_end(target).map_err(io)?;
-                let came = if items == 0 { target.len() } else { fragment.len() - before };
-                if came != len as usize {
-                    return Err(bad("is truncated inside its RLE fragments"));
-                }
-                items += 1;
-            }
-            (_, true) => break,
-            _ => return Err(bad("has something else than fragments")),
-        }
-    }
+    let fragment = super::fragments::read(rest, fragments_max_bytes(pixels * size))?;
     let word = |offset: usize| {
         let bytes = fragment.get(offset..offset + 4)?.try_into().ok()?;
         Some(u32::from_le_bytes(bytes) as usize)

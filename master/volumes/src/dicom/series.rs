@@ -1,9 +1,9 @@
 //! Groups the files of a folder into series, sorts the slices of one, places them and writes its
 //! samples.
 
-use super::elements::{File, Pixels, Tag};
-use super::rle;
+use super::elements::{File, Packing, Pixels, Tag};
 use super::wire::Preface;
+use super::{fragments, frames, jpeg, jpeg_ls, rle};
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::pick::{Axis, Kind, Pick};
 use crate::samples::{DIM_MAX, Endian, Layout, Number};
@@ -32,6 +32,8 @@ struct Slice {
     native_bytes: Option<u64>,
     /// Whether the stored numbers are indices of a palette.
     palette: bool,
+    /// Where the pixels are in a file of several frames.
+    frame: Option<frames::Frame>,
 }
 
 /// Size and number format of a picture. All slices of a series have one size; each may have a
@@ -135,9 +137,12 @@ pub(super) fn write(
         notes.push(format!("{n} DICOM file{were} left out: {first}"));
     }
     let preface = arrange(&mut series, &choice.pick, &mut notes)?;
+    let read = |slice: &Slice| pixels(slice, preface.number).map_err(|p| in_file(&slice.path, p));
+    // After the first byte a problem can't be told in full, and most are those of all slices.
+    let mut first = Some(read(&series.slices[0])?);
     preface.write(out).map_err(|e| Problem::io("pipe", &e))?;
     for slice in &series.slices {
-        let bytes = pixels(slice, preface.number).map_err(|p| in_file(&slice.path, p))?;
+        let bytes = first.take().map_or_else(|| read(slice), Ok)?;
         out.write_all(&bytes).map_err(|e| Problem::io("pipe", &e))?;
     }
     out.flush().map_err(|e| Problem::io("pipe", &e))
@@ -160,7 +165,7 @@ fn gather(files: &[PathBuf]) -> Result<(Vec<Series>, usize, LeftOut), Problem> {
     let (mut left_out, mut unread) = (0, Vec::new());
     for path in files {
         let source = Source::open(path, "file").map_err(|p| in_file(path, p))?;
-        let file = match File::open(source) {
+        let mut file = match File::open(source) {
             Ok(file) => file,
             // DICOMDIR, reports and other files without pixels.
             Err(p) if p.kind == OpenErrorKind::NotAVolume => {
@@ -172,32 +177,52 @@ fn gather(files: &[PathBuf]) -> Result<(Vec<Series>, usize, LeftOut), Problem> {
                 continue;
             }
         };
-        let slice = match Slice::from_file(path, &file) {
-            Ok(slice) => slice,
+        let slices = match slices(path, &mut file) {
+            Ok(slices) => slices,
             Err(p) => {
                 unread.push((path.clone(), in_file(path, p)));
                 continue;
             }
         };
         let get = |tag: Tag| file.text(tag).unwrap_or_default();
-        // A localizer has pictures in several orientations under one UID.
-        let orientation = slice.place.map(|(_, [r, c])| {
-            let n = r.normalize_or_zero().cross(c.normalize_or_zero());
-            format!("{:.2} {:.2} {:.2}", n.x + 0.0, n.y + 0.0, n.z + 0.0)
-        });
-        let uid = get((0x0020, 0x000e));
-        let key =
-            (uid.clone(), slice.format.columns, slice.format.rows, orientation.unwrap_or_default());
-        let series = all.entry(key).or_insert_with(|| Series {
-            uid,
-            number: get((0x0020, 0x0011)),
-            description: get((0x0008, 0x103e)),
-            modality: get((0x0008, 0x0060)),
-            slices: Vec::new(),
-        });
-        series.slices.push(slice);
+        for slice in slices {
+            // A localizer has pictures in several orientations under one UID.
+            let orientation = slice.place.map(|(_, [r, c])| {
+                let n = r.normalize_or_zero().cross(c.normalize_or_zero());
+                format!("{:.2} {:.2} {:.2}", n.x + 0.0, n.y + 0.0, n.z + 0.0)
+            });
+            let uid = get((0x0020, 0x000e));
+            let key = (
+                uid.clone(),
+                slice.format.columns,
+                slice.format.rows,
+                orientation.unwrap_or_default(),
+            );
+            let series = all.entry(key).or_insert_with(|| Series {
+                uid,
+                number: get((0x0020, 0x0011)),
+                description: get((0x0008, 0x103e)),
+                modality: get((0x0008, 0x0060)),
+                slices: Vec::new(),
+            });
+            series.slices.push(slice);
+        }
     }
     Ok((all.into_values().collect(), left_out, unread))
+}
+
+/// Returns the slices of a file: one, or one for each frame.
+fn slices(path: &Path, file: &mut File) -> Result<Vec<Slice>, Problem> {
+    let frames = frames::frames(file)?;
+    if frames.is_empty() {
+        return Ok(vec![Slice::from_file(path, file)?]);
+    }
+    let slice = |frame: frames::Frame| {
+        file.select(&frame);
+        let slice = Slice::from_file(path, file)?;
+        Ok(Slice { native_bytes: None, frame: Some(frame), ..slice })
+    };
+    frames.into_iter().map(slice).collect()
 }
 
 /// Picks the chosen series, or fails with a list of all.
@@ -291,7 +316,7 @@ impl Slice {
         if frames.is_some_and(|n| !matches!(n.parse::<f64>(), Ok(n) if n == 0.0 || n == 1.0)) {
             return refuse(
                 "NumberOfFrames",
-                "is above 1: many pictures in one file are not read".into(),
+                "is above 1, and the file does not say where its frames lie".into(),
                 "convert it, for instance with dcm2niix",
             );
         }
@@ -374,13 +399,18 @@ impl Slice {
             let column = DVec3::new(d[3], d[4], d[5]) * spacing[1];
             (DVec3::from_array(p), [row, column])
         });
-        let [slope] = file.numbers::<1>((0x0028, 0x1053))?.unwrap_or([1.0]);
+        // Of a dose, the grid's scale.
+        let slope = match file.numbers::<1>((0x0028, 0x1053))? {
+            None => file.numbers::<1>((0x3004, 0x000e))?,
+            slope => slope,
+        };
+        let [slope] = slope.unwrap_or([1.0]);
         let [intercept] = file.numbers::<1>((0x0028, 0x1052))?.unwrap_or([0.0]);
         let rescale = if slope == 0.0 { [1.0, 0.0] } else { [slope, intercept] };
         let instance = file.numbers::<1>((0x0020, 0x0013)).ok().flatten().map_or(0.0, |[n]| n);
         let native_bytes = match file.pixels {
             Pixels::Native { bytes, .. } => Some(bytes),
-            Pixels::Rle => None,
+            Pixels::Packed(_) => None,
         };
         Ok(Slice {
             path: path.into(),
@@ -392,6 +422,7 @@ impl Slice {
             thickness_note,
             native_bytes,
             palette,
+            frame: None,
         })
     }
 
@@ -607,6 +638,9 @@ fn millimetres(x: f64) -> String {
 fn pixels(slice: &Slice, number: Number) -> Result<Vec<u8>, Problem> {
     let source = Source::open(&slice.path, "file")?;
     let len = source.len;
+    if let Some(frame) = &slice.frame {
+        return pixels_of(slice, File::of_frame(source, frame)?, len, number);
+    }
     let file = File::open(source)?;
     if Slice::from_file(&slice.path, &file)?.format != slice.format {
         return Err(Problem::malformed("file", "changed while it was read", "try again"));
@@ -618,8 +652,9 @@ fn pixels(slice: &Slice, number: Number) -> Result<Vec<u8>, Problem> {
 #[cfg(test)]
 pub(crate) fn one_slice(source: Source) -> Result<Vec<u8>, Problem> {
     let len = source.len;
-    let file = File::open(source)?;
-    pixels_of(&Slice::from_file(Path::new("slice"), &file)?, file, len, Number::F32)
+    let mut file = File::open(source)?;
+    let slice = slices(Path::new("slice"), &mut file)?.swap_remove(0);
+    pixels_of(&slice, file, len, Number::F32)
 }
 
 /// Returns the samples of an open file of `len` bytes, like [`pixels`].
@@ -628,7 +663,16 @@ fn pixels_of(slice: &Slice, mut file: File, len: u64, number: Number) -> Result<
     let size = usize::from(format.allocated / 8);
     let count = usize::from(format.columns) * usize::from(format.rows);
     let bytes = match file.pixels {
-        Pixels::Rle => rle::unpack(&mut *file.rest, count, size)?,
+        Pixels::Packed(Packing::Rle) => rle::unpack(&mut *file.rest, count, size)?,
+        Pixels::Packed(packing) => {
+            let most = jpeg::fragments_max_bytes(count * size);
+            let fragment = fragments::read(&mut *file.rest, most)?;
+            let sizes = (format.columns, format.rows);
+            match packing {
+                Packing::JpegLs => jpeg_ls::unpack(&fragment, sizes, size)?,
+                _ => jpeg::unpack(&fragment, sizes, size)?,
+            }
+        }
         Pixels::Native { bytes: have, words } => {
             let need = (count * size) as u64;
             slice.padding_bytes()?;

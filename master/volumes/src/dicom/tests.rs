@@ -12,12 +12,19 @@ pub(crate) enum Syntax {
     Big,
     Deflated,
     Rle,
+    Lossless,
 }
 
-pub(crate) const ALL: [Syntax; 5] =
-    [Syntax::Implicit, Syntax::Explicit, Syntax::Big, Syntax::Deflated, Syntax::Rle];
+pub(crate) const ALL: [Syntax; 6] = [
+    Syntax::Implicit,
+    Syntax::Explicit,
+    Syntax::Big,
+    Syntax::Deflated,
+    Syntax::Rle,
+    Syntax::Lossless,
+];
 
-fn element(
+pub(crate) fn element(
     out: &mut Vec<u8>,
     explicit: bool,
     big: bool,
@@ -70,6 +77,7 @@ pub(crate) fn slice(
         Syntax::Deflated => "1.2.840.10008.1.2.1.99",
         Syntax::Big => "1.2.840.10008.1.2.2",
         Syntax::Rle => "1.2.840.10008.1.2.5",
+        Syntax::Lossless => "1.2.840.10008.1.2.4.70",
     };
     element(&mut meta, true, false, (2, 0x10), "UI", name.as_bytes());
     let mut body = Vec::new();
@@ -106,7 +114,7 @@ pub(crate) fn slice(
         put((0x28, 0x3000), "SQ", &[0xfe, 0xff, 0, 0xe0, 0, 0, 0, 0]);
     }
     let words: Vec<u8> = pixels.iter().flat_map(|p| short(*p as u16)).collect();
-    if syntax == Syntax::Rle {
+    if matches!(syntax, Syntax::Rle | Syntax::Lossless) {
         let halves = [1, 0].map(|b| {
             packbits_literals(&words.iter().skip(b).step_by(2).copied().collect::<Vec<_>>())
         });
@@ -115,8 +123,14 @@ pub(crate) fn slice(
         fragment[4..8].copy_from_slice(&64u32.to_le_bytes());
         fragment[8..12].copy_from_slice(&(64 + halves[0].len() as u32).to_le_bytes());
         fragment.extend(halves.concat());
+        if syntax == Syntax::Lossless {
+            let words: Vec<u16> = pixels.iter().map(|p| *p as u16).collect();
+            fragment = super::jpeg::tests::lossless(&words, 3, 16, 1);
+        }
         body.extend([0xe0, 0x7f, 0x10, 0, b'O', b'B', 0, 0, 0xff, 0xff, 0xff, 0xff]);
-        for item in [&[][..], &fragment] {
+        // In two fragments, as the standard allows.
+        let (first, second) = fragment.split_at(fragment.len() / 4 * 2);
+        for item in [&[][..], first, second] {
             body.extend([0xfe, 0xff, 0, 0xe0]);
             body.extend((item.len() as u32).to_le_bytes());
             body.extend(item);

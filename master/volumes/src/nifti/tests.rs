@@ -203,7 +203,7 @@ fn nifti_errors_name_field_and_remedy() {
         (70, &[32, 0], "datatype: 32 is complex"),
         (70, &[3, 0], "datatype: 3 is not a type"),
         (344, b"ni1", "magic: is the header of a pair"),
-        (344, b"\0\0\0", "magic: is `\\0\\0\\0\\0`, so this is ANALYZE"),
+        (344, b"\0\0\0", "magic: is `\\0\\0\\0\\0`, so this is damaged, or an ANALYZE header"),
         (40, &[2, 0], "dim[0]: is 2"),
         (42, &[0, 0], "dim: 0 x 3 x 2 has no samples"),
         (42, &[0xff, 0xff], "has no samples"),

@@ -262,3 +262,55 @@ fn ome_tiff_step_that_is_missing_or_without_known_unit_goes_by_x_and_is_noted() 
         assert!(notes.contains(say) && notes.is_empty() == say.is_empty(), "{z}: {notes}");
     }
 }
+
+/// A TIFF file of one strip, by hand: the `tiff` crate writes no pixels of fewer than 8 bits.
+fn few_bits(bits: u16, photometric: u16, width: u16, rows: &[u8]) -> Vec<u8> {
+    let mut out = b"II*\0\x08\0\0\0".to_vec();
+    let height = rows.len() / (usize::from(width * bits)).div_ceil(8);
+    let palette = 3 << bits;
+    let entries: [(u16, u16, u32, u32); 9] = [
+        (256, 3, 1, width.into()),
+        (257, 3, 1, height as u32),
+        (258, 3, 1, bits.into()),
+        (259, 3, 1, 1),
+        (262, 3, 1, photometric.into()),
+        (273, 4, 1, 122),
+        (278, 3, 1, height as u32),
+        (279, 4, 1, rows.len() as u32),
+        (320, 3, palette, 200),
+    ];
+    let entries = &entries[..if photometric == 3 { 9 } else { 8 }];
+    out.extend((entries.len() as u16).to_le_bytes());
+    for (tag, kind, count, value) in entries {
+        out.extend(tag.to_le_bytes());
+        out.extend(kind.to_le_bytes());
+        out.extend(count.to_le_bytes());
+        out.extend(value.to_le_bytes());
+    }
+    out.extend([0; 4]);
+    out.resize(122, 0);
+    out.extend(rows);
+    out.resize(200 + 2 * palette as usize, 0);
+    out
+}
+
+#[test]
+fn tiff_of_few_bits_and_with_a_palette_keeps_stored_values() {
+    let open = |bytes: Vec<u8>| {
+        let opened = super::read(Source::from_bytes(bytes), "a.tif", &RawHints::default())?;
+        let v = opened.volume;
+        let codes: Vec<f64> =
+            (0..v.samples.len()).map(|i| v.summary.map.value(v.samples.code(i))).collect();
+        Ok::<_, Problem>((v.lattice.dims, codes))
+    };
+    for photometric in [0, 1, 3] {
+        let (dims, codes) = open(few_bits(1, photometric, 10, &[0xa0, 0x40, 0x01, 0x80])).unwrap();
+        assert_eq!(dims, [10, 2, 1]);
+        assert_eq!(codes[..10], [1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
+        assert_eq!(codes[10..], [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0]);
+        let (_, codes) = open(few_bits(4, photometric, 3, &[0x1f, 0x70])).unwrap();
+        assert_eq!(codes, [1.0, 15.0, 7.0], "photometric {photometric}");
+        let (_, codes) = open(few_bits(2, photometric, 5, &[0x1b, 0x40])).unwrap();
+        assert_eq!(codes, [0.0, 1.0, 2.0, 3.0, 1.0]);
+    }
+}

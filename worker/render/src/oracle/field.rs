@@ -19,16 +19,18 @@ use std::sync::Arc;
 /// A voxel: first plane, depth in phases, brick and index in it.
 type Voxel = (i32, i32, usize, usize);
 
-/// Renders a frame whose sheets hold planes of a field, in sums of `S`.
+/// Renders rows of a frame whose sheets hold planes of a field, in sums of `S`; the others stay
+/// empty.
 pub(super) fn render<S: FieldSum>(
     frame: &Frame,
     bricks: &[Arc<Brick>],
     mut counters: Option<&mut WorkCounters>,
+    rows: (i32, i32),
 ) -> Picture {
     let (Some(rule), Some(scene)) = (&frame.field, &frame.scene.field) else {
         unreachable!("a frame whose sheets hold planes")
     };
-    let [w, h] = frame.view.size.map(|n| n as usize);
+    let w = frame.view.size[0] as usize;
     let whole = Rect::from_size(frame.view.size);
     let mut voxels: Vec<Voxel> = Vec::new();
     let mut range = SheetRange::default();
@@ -53,32 +55,40 @@ pub(super) fn render<S: FieldSum>(
     let mut here = before.clone();
     let (mut bx, mut by) = (Vec::new(), Vec::new());
     for k in range.first..range.end {
-        here.fill([S::default(); 4]);
+        here[rows.0 as usize * w..rows.1 as usize * w].fill([S::default(); 4]);
         for &v in &buckets[(k - range.first) as usize] {
             let (first, z, b, i) = voxels[v as usize];
             let brick = &bricks[b];
             let Some(footprint) = frame.footprints.at(k) else { continue };
+            let placed = frame.place(&frame.corner(brick.id), brick.index[i]);
+            let at = frame.screen(&placed, k, &footprint);
+            let (y0, wy) = S::window(&footprint, 1, at[1], rows, &mut by);
+            if wy.is_empty() {
+                continue;
+            }
             let payload = S::payload_of(frame.field_payload(rule, brick, i));
             let plane = planes_of::<S>(&frame.sections, z)[(k - first) as usize];
             let section = weighted::<S>([payload; 4], plane);
-            let placed = frame.place(&frame.corner(brick.id), brick.index[i]);
-            let at = frame.screen(&placed, k, &footprint);
-            let (y0, wy) = S::window(&footprint, 1, at[1], (0, h as i32), &mut by);
             for (y, &wy) in (y0..).zip(wy) {
                 let row = weighted::<S>(section, wy);
                 let along = frame.along_row(at, y);
                 let (x0, wx) = S::window(&footprint, 0, along, (0, w as i32), &mut bx);
+                // Nobody reads sums of shut pixels; whoever counts does so for people who wait.
+                let run = Rect::new(x0, y, x0 + wx.len() as i32, y + 1);
+                if counters.as_ref().is_some_and(|counters| counters.all_shut(run)) {
+                    continue;
+                }
                 for (x, &wx) in (x0..).zip(wx) {
                     let term = weighted::<S>(row, wx);
                     let pixel = &mut here[y as usize * w + x as usize];
                     *pixel = std::array::from_fn(|c| pixel[c].with(term[c]));
                 }
                 if let Some(counters) = counters.as_mut() {
-                    counters.add_section(Rect::new(x0, y, x0 + wx.len() as i32, y + 1));
+                    counters.add_section(run);
                 }
             }
         }
-        for y in 0..h {
+        for y in rows.0 as usize..rows.1 as usize {
             for x in 0..w {
                 let i = y * w + x;
                 if here[i][0].value() == 0.0 || frame.rule.is_shut(out.a[i]) {

@@ -27,6 +27,19 @@ fn cameras(p: &ViewPath) -> Vec<Camera> {
     (0..p.frames()).map(|i| ready.camera(i).unwrap()).collect()
 }
 
+#[test]
+fn frames_at_keys_from_a_side_have_its_name() {
+    let side = |view| Key { view: Some(view), ..Key::default() };
+    let keys = vec![side(Side::Left), turned(10.0, 0.0), side(Side::Superior)];
+    let all = path(3, Easing::Smooth, keys.clone());
+    let names = |p: &ViewPath, n: usize| (0..n).map(|i| p.side_name(i)).collect::<Vec<_>>();
+    assert_eq!(names(&all, 4), [Some("left"), None, Some("superior"), None]);
+    // Between keys nothing has a name.
+    let long = path(5, Easing::Smooth, keys);
+    assert_eq!(names(&long, 5), [Some("left"), None, None, None, Some("superior")]);
+    assert!(long.has_sides() && !path(2, Easing::Linear, vec![turned(0.0, 0.0)]).has_sides());
+}
+
 fn pose(c: &Camera) -> Pose {
     Pose::of(c).unwrap()
 }

@@ -69,6 +69,10 @@ pub struct Queues {
     /// the buckets of all sheets each time.
     pub filled: usize,
     carried: Vec<Waiting>,
+    /// All buckets before this one that are not done have memory.
+    bare: usize,
+    /// Voxels of the fullest bucket so far: all memory holds as many in the end.
+    fullest: usize,
 }
 
 impl Queues {
@@ -79,7 +83,20 @@ impl Queues {
             self.buckets.resize_with(sheets, Vec::new);
         }
         let filled = std::mem::take(&mut self.filled);
-        self.buckets[..filled].iter_mut().for_each(Vec::clear);
+        for bucket in &mut self.buckets[..filled] {
+            self.fullest = self.fullest.max(bucket.len());
+            bucket.clear();
+        }
+        // Memory of an earlier part is where its walk ended; it is needed in front.
+        let mut with_memory = 0;
+        for at in 0..self.buckets.len() {
+            if self.buckets[at].capacity() > 0 {
+                self.buckets.swap(with_memory, at);
+                with_memory += 1;
+            }
+        }
+        self.buckets[..with_memory].iter_mut().for_each(|b| b.reserve(self.fullest));
+        self.bare = with_memory;
         self.carried.clear();
     }
 
@@ -88,6 +105,20 @@ impl Queues {
     pub fn put(&mut self, sheet: usize, voxel: Waiting) {
         self.buckets[sheet].push(voxel);
         self.filled = self.filled.max(sheet + 1);
+    }
+
+    /// Passes the memory of bucket `at`, whose sheet is done, on to the next bucket that has none.
+    #[inline(always)]
+    fn pass_on(&mut self, at: usize, memory: Vec<Waiting>) {
+        if memory.capacity() == 0 {
+            return;
+        }
+        self.bare = self.bare.max(at + 1);
+        while self.buckets.get(self.bare).is_some_and(|b| b.capacity() > 0) {
+            self.bare += 1;
+        }
+        let to = if self.bare < self.buckets.len() { self.bare } else { at };
+        self.buckets[to] = memory;
     }
 
     /// Returns the number of voxels whose first sheet drawing has not reached.
@@ -300,8 +331,9 @@ impl General<'_> {
                 bucket.sort_unstable_by_key(|v| (part.brick(v.brick as usize).0.id, v.voxel));
             }
             contents.splat_all(self, &bucket, k, kind, (&open, counters));
+            queues.fullest = queues.fullest.max(bucket.len());
             bucket.clear();
-            queues.buckets[(k - slab.first) as usize] = bucket;
+            queues.pass_on((k - slab.first) as usize, bucket);
             if self.close(&contents, k, &kind.planes, &mut open, pixels) {
                 any_open = open.count() > 0;
             }

@@ -1,4 +1,4 @@
-//! Text of charts: its width, and its pixels where a writer has no letters of its own.
+//! Text on pictures and charts: its width and its pixels.
 //!
 //! In a font that is part of the program, since a node of a cluster may have none. swash draws the
 //! outline of each letter; letters stand side by side by their advance, unkerned.
@@ -18,8 +18,14 @@ fn font() -> FontRef<'static> {
 }
 
 /// Returns the width of a text in pixels; `em` is the font's size in pixels.
-pub(crate) fn width(text: &str, em: f64) -> f64 {
+pub fn width(text: &str, em: f64) -> f64 {
     letters(text, em).map(|(_, wide)| wide).sum()
+}
+
+/// Returns the first character of a text that the font has no letter for.
+pub fn missing(text: &str) -> Option<char> {
+    let letters = font().charmap();
+    text.chars().find(|&c| letters.map(c) == 0)
 }
 
 /// Returns each letter's glyph and its advance in pixels.
@@ -34,7 +40,7 @@ fn letters(text: &str, em: f64) -> impl Iterator<Item = (GlyphId, f64)> {
 
 /// The way in which a line of text runs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Way {
+pub enum Way {
     /// From left to right.
     Right,
     /// From below to above.
@@ -46,7 +52,7 @@ pub(crate) enum Way {
 ///
 /// # Errors
 /// The first one of `put`.
-pub(crate) fn draw<E>(
+pub fn draw<E>(
     text: &str,
     em: f64,
     start: (f64, f64),
@@ -124,6 +130,15 @@ mod tests {
         let want = [top, bottom, 200 - right, 200 - left];
         assert!(turned.iter().zip(want).all(|(a, b)| (a - b).abs() <= 1), "{turned:?} {want:?}");
         assert!((covered - the_same).abs() < 0.02 * covered, "{covered} {the_same}");
+    }
+
+    #[test]
+    fn letters_of_europe_are_there_and_others_are_named() {
+        assert_eq!(
+            missing("T1, 5 \u{b5}m, \u{3b1}, \u{c5}\u{142}\u{f6}\u{17e}, \u{416}\u{444}"),
+            None
+        );
+        assert_eq!(missing("a \u{6f22}b"), Some('\u{6f22}'));
     }
 
     #[test]

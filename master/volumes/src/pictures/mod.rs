@@ -1,0 +1,306 @@
+//! Reader of stacks of PNG and JPEG pictures: the files of a folder, in the order of the numbers in
+//! their names, become slices.
+//!
+//! A picture is grey, or has colours of which red, green and blue are equal in every pixel. The
+//! values are those that are stored: a PNG of one bit holds 0 and 1. Pictures have no spacing; it
+//! comes from `--spacing`.
+
+pub(crate) mod jpeg;
+mod png;
+
+use crate::Opened;
+use crate::error::{OpenErrorKind, Problem, quoted};
+use crate::limit::ByteCap;
+use crate::raw::RawHints;
+use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
+use crate::source::{Notes, Source};
+use crate::unpack::wrapped;
+use slabcast_common::volume::{Lattice, Volume};
+use std::collections::VecDeque;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// Most bytes of a picture that is decoded whole; room for 4096 x 4096 of 16 bits, and below the
+/// 64 MiB that reading may take beside the voxels.
+const WHOLE_MAX_BYTES: u64 = 48 << 20;
+/// Most bytes of a whole picture in a small file. A larger one needs a byte of the file for each
+/// [`WHOLE_RATIO`] of them.
+const WHOLE_FREE_BYTES: u64 = 1 << 20;
+/// A block of 64 pixels takes six bits of a JPEG at least, unless it is progressive.
+const WHOLE_RATIO: u64 = 128;
+
+/// Returns whether the first bytes are PNG.
+pub(crate) fn is_png(head: &[u8]) -> bool {
+    head.starts_with(b"\x89PNG\r\n\x1a\n")
+}
+
+/// Returns whether the first bytes are JPEG.
+pub(crate) fn is_jpeg(head: &[u8]) -> bool {
+    head.starts_with(b"\xff\xd8\xff")
+}
+
+/// Checks that a picture of `bytes` bytes may be decoded whole, out of a file of `len` bytes.
+fn check_whole(bytes: u64, len: u64) -> Result<(), Problem> {
+    let most = WHOLE_MAX_BYTES.min(WHOLE_FREE_BYTES.max(WHOLE_RATIO.saturating_mul(len)));
+    if bytes <= most {
+        return Ok(());
+    }
+    Err(Problem::new(
+        OpenErrorKind::TooLarge,
+        "picture",
+        format!("of {bytes} bytes is more than the {most} that are read at a time"),
+        "save it as PNG without interlacing, or as TIFF",
+    ))
+}
+
+/// Size and type of a picture, the same for all of a stack.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Shape {
+    width: u32,
+    height: u32,
+    number: Number,
+}
+
+impl std::fmt::Display for Shape {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} x {} {}", self.width, self.height, self.number.name())
+    }
+}
+
+/// An open picture, whose rows come one after another.
+enum Picture {
+    Png(Box<png::Png>),
+    Jpeg(jpeg::Jpeg),
+}
+
+impl Picture {
+    /// Opens a file and reads its header.
+    fn open(path: &Path, notes: &Notes) -> Result<(Picture, u64), Problem> {
+        let mut source = Source::open(path, "file")?;
+        source.notes = notes.clone();
+        let len = source.len;
+        let picture = match is_jpeg(source.head()?) {
+            true => Picture::Jpeg(jpeg::Jpeg::open(source)?),
+            false => Picture::Png(Box::new(png::Png::open(source)?)),
+        };
+        let Shape { width, height, number } = picture.shape();
+        Layout::new([width.into(), height.into(), 1], number, Endian::Big, "size")?;
+        Ok((picture, len))
+    }
+
+    fn shape(&self) -> Shape {
+        match self {
+            Picture::Png(png) => png.shape,
+            Picture::Jpeg(jpeg) => jpeg.shape,
+        }
+    }
+
+    /// Returns the colours that its pixels are numbers of, if it has some that are not grey.
+    fn palette(&self) -> Option<&[u8]> {
+        match self {
+            Picture::Png(png) => png.palette.as_deref(),
+            Picture::Jpeg(_) => None,
+        }
+    }
+
+    /// Writes the samples of the next rows, big-endian.
+    fn rows(&mut self, out: &mut Vec<u8>) -> Result<(), Problem> {
+        match self {
+            Picture::Png(png) => png.row(out),
+            Picture::Jpeg(jpeg) => jpeg.all(out),
+        }
+    }
+}
+
+/// Returns the error for a pixel whose red, green and blue differ.
+fn colours() -> Problem {
+    Problem::unsupported(
+        "picture",
+        "is in colours: red, green and blue differ",
+        "save the stack in shades of grey, or one of its colours",
+    )
+}
+
+/// Writes the grey of pixels of `channels` numbers of `size` bytes: one, grey and opacity, three
+/// colours, or those and opacity. Returns whether all are opaque.
+fn push_grey(
+    pixels: &[u8],
+    channels: usize,
+    size: usize,
+    out: &mut Vec<u8>,
+) -> Result<bool, Problem> {
+    if channels == 1 {
+        out.extend_from_slice(pixels);
+        return Ok(true);
+    }
+    let (mut opaque, mut grey) = (true, true);
+    for pixel in pixels.chunks_exact(channels * size) {
+        let at = |i: usize| &pixel[i * size..(i + 1) * size];
+        if channels >= 3 {
+            grey &= at(0) == at(1) && at(1) == at(2);
+        }
+        if channels.is_multiple_of(2) {
+            opaque &= at(channels - 1).iter().all(|b| *b == 0xff);
+        }
+        out.extend_from_slice(at(0));
+    }
+    if grey { Ok(opaque) } else { Err(colours()) }
+}
+
+/// Reads pictures, in the order given, as slices of a volume called `name`, of at most `cap`.
+pub(crate) fn read_files(
+    files: Vec<PathBuf>,
+    name: &str,
+    hints: &RawHints,
+    cap: ByteCap,
+) -> Result<Opened, Problem> {
+    let count = files.len() as u64;
+    if count > DIM_MAX {
+        return Err(Problem::new(
+            OpenErrorKind::TooLarge,
+            "folder",
+            format!("{count} pictures are more than {DIM_MAX}"),
+            "leave some out",
+        ));
+    }
+    let notes = Notes::default();
+    let (mut first, mut total) = (None, 0);
+    for path in &files {
+        let shown = quoted(&path.file_name().unwrap_or_default().to_string_lossy());
+        let (picture, len) = Picture::open(path, &notes).map_err(|p| in_file(path, p))?;
+        total += len;
+        let (shape, palette) = (picture.shape(), picture.palette().map(<[u8]>::to_vec));
+        match &first {
+            None => first = Some((shape, palette)),
+            Some((first, _)) if shape != *first => return Err(differs(&shown, shape, *first)),
+            Some((_, first)) if palette != *first => {
+                return Err(Problem::unsupported(
+                    shown,
+                    "has another palette than the first",
+                    "save the stack in shades of grey",
+                ));
+            }
+            Some(_) => {}
+        }
+    }
+    let (shape, _) = first.expect("the caller passes a file");
+    let sizes = [shape.width.into(), shape.height.into(), count];
+    let layout = Layout::new(sizes, shape.number, Endian::Big, "pictures")?;
+    let lattice = Lattice::from_spacing(layout.dims, hints.spacing.unwrap_or([1.0; 3]));
+    lattice.check().map_err(|e| Problem::malformed("--spacing", e, "give three lengths"))?;
+    let mut stack = Stack {
+        current: None,
+        files: files.into(),
+        shape,
+        rows: Vec::new(),
+        consumed: 0,
+        left: 0,
+        notes: notes.clone(),
+    };
+    // Deflate is denser than JPEG, of which a byte holds some hundred pixels.
+    let supply = Supply::deflate("pictures", total);
+    let (samples, map) = samples::read(&mut stack, supply, &layout, cap)?;
+    if hints.spacing.is_none() {
+        notes.add("pictures have no spacing; 1 mm was taken (--spacing sets it)");
+    }
+    let volume = Volume::new(name, shape.number.name(), false, lattice, samples, map);
+    Ok(Opened { volume, notes: notes.take() })
+}
+
+fn in_file(path: &Path, mut p: Problem) -> Problem {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    p.field = format!("{} {}", quoted(&name), p.field);
+    p
+}
+
+fn differs(which: &str, shape: Shape, first: Shape) -> Problem {
+    Problem::malformed(
+        which,
+        format!("is {shape}, where the first is {first}"),
+        "make all of one size and type, or leave it out",
+    )
+}
+
+/// Reads the samples of all pictures, one after another.
+struct Stack {
+    current: Option<(PathBuf, Picture)>,
+    /// Files not yet opened.
+    files: VecDeque<PathBuf>,
+    shape: Shape,
+    /// Samples of the current rows.
+    rows: Vec<u8>,
+    /// Bytes of them that were handed out.
+    consumed: usize,
+    /// Bytes of the current picture that are still to be decoded.
+    left: u64,
+    notes: Notes,
+}
+
+impl Stack {
+    /// Decodes the next rows; false at the end.
+    fn fill(&mut self) -> Result<bool, Problem> {
+        if self.left == 0 {
+            let Some(path) = self.files.pop_front() else { return Ok(false) };
+            let (picture, _) = Picture::open(&path, &self.notes).map_err(|p| in_file(&path, p))?;
+            // The file may have changed since the first pass.
+            if picture.shape() != self.shape {
+                return Err(differs("a picture", picture.shape(), self.shape));
+            }
+            let Shape { width, height, number } = self.shape;
+            self.left = u64::from(width) * u64::from(height) * number.bytes();
+            self.current = Some((path, picture));
+        }
+        let Some((path, picture)) = &mut self.current else { return Ok(false) };
+        self.rows.clear();
+        self.consumed = 0;
+        picture.rows(&mut self.rows).map_err(|p| in_file(path, p))?;
+        let came = self.rows.len() as u64;
+        if came == 0 || came > self.left {
+            let problem = Problem::new(
+                OpenErrorKind::Damaged,
+                "picture",
+                "ends early, or goes on too long",
+                "get the whole file",
+            );
+            return Err(in_file(path, problem));
+        }
+        self.left -= came;
+        Ok(true)
+    }
+}
+
+impl Read for Stack {
+    fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
+        if self.consumed == self.rows.len() && !self.fill().map_err(wrapped)? {
+            return Ok(0);
+        }
+        let n = (self.rows.len() - self.consumed).min(buf.len());
+        buf[..n].copy_from_slice(&self.rows[self.consumed..self.consumed + n]);
+        self.consumed += n;
+        Ok(n)
+    }
+}
+
+/// Reads all samples of one picture, for the mutants of `fuzz.rs`.
+#[cfg(test)]
+pub(crate) fn one_picture(mut source: Source) -> Result<Vec<u8>, Problem> {
+    let mut picture = match is_jpeg(source.head()?) {
+        true => Picture::Jpeg(jpeg::Jpeg::open(source)?),
+        false => Picture::Png(Box::new(png::Png::open(source)?)),
+    };
+    let Shape { width, height, number } = picture.shape();
+    let need = u64::from(width) * u64::from(height) * number.bytes();
+    let (mut rows, mut have) = (Vec::new(), 0);
+    while have < need {
+        rows.clear();
+        picture.rows(&mut rows)?;
+        if rows.is_empty() {
+            return Err(samples::truncated(need, have));
+        }
+        have += rows.len() as u64;
+    }
+    Ok(rows)
+}
+
+#[cfg(test)]
+pub(crate) mod tests;

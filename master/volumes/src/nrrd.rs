@@ -433,7 +433,8 @@ impl Axes {
             match kind.as_str() {
                 "time" => Axis::new(Kind::Time, "times", size),
                 _ if time => Axis::new(Kind::Time, "times", size),
-                "list" => Axis::new(Kind::Other, "volumes (a list)", size),
+                // Before the axes of space it is of each voxel.
+                "list" if axis > 0 => Axis::new(Kind::Other, "volumes (a list)", size),
                 "" | "none" | "???" | "domain" | "space" if axis > 0 => {
                     Axis::new(Kind::Other, format!("along axis {}", axis + 1), size)
                 }

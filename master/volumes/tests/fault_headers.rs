@@ -61,10 +61,13 @@ fn dicom_series_are_not_refused_without_need() {
 
 #[test]
 fn nrrd_and_metaimage_axes_are_those_of_space() {
-    for file in ["rgb_2d.nrrd", "list_one_slice.nrrd"] {
+    for (file, say) in [
+        ("rgb_2d.nrrd", "is no axis of space"),
+        ("list_one_slice.nrrd", "a voxel is 3 components (list), not one number"),
+    ] {
         let Some(path) = fault(&format!("11-nrrd-vector-axis-as-x/{file}")) else { return };
         let e = open(&path).unwrap_err().to_string();
-        assert!(e.contains("is no axis of space"), "{e}");
+        assert!(e.contains(say), "{e}");
     }
     for (file, origin) in [
         ("no_matrix.mha", Some([31.5, -12.25, 107.75])),

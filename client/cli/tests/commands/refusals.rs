@@ -289,7 +289,10 @@ fn files() -> Vec<(&'static [&'static str], &'static [&'static str])> {
         (&["info", "end.mha"], &["end.mha", "ElementDataFile", "LOCAL"]),
         (&["info", "short.mha"], &["short.mha", "16 bytes are needed and 8 are there"]),
         (&["info", "lost.mhd"], &["lost.mhd", "ElementDataFile", "lost.raw"]),
-        (&["info", "channels.mha"], &["channels.mha", "ElementNumberOfChannels", "one channel"]),
+        (
+            &["info", "channels.mha"],
+            &["channels.mha", "ElementNumberOfChannels", "--channel 0 to 2"],
+        ),
         (&["info", "poly.vti"], &["poly.vti", "VTKFile type", "Resample To Image"]),
         (&["info", "extent.vti"], &["extent.vti", "ImageData WholeExtent", "is missing"]),
         (&["info", "word.vti"], &["word.vti", "DataArray `v`", "number 3 is `x`"]),

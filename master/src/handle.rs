@@ -30,6 +30,10 @@ const PLANS_AT_ONCE: usize = 2;
 /// Events that wait for the driver before whoever sends one has to wait.
 const INBOX: usize = 1024;
 
+/// Calls at a time that look at folders or write a piece of an upload. They wait for no file that is
+/// being read.
+const LOOKS_AT_ONCE: usize = 4;
+
 /// Settings of a master: its volumes, memory, scheduler and record.
 pub struct MasterConfig {
     /// The volumes that the master serves.
@@ -109,6 +113,7 @@ impl Master {
             jobs: jobs.clone(),
             library: library.clone(),
             planning: Arc::new(Semaphore::new(PLANS_AT_ONCE)),
+            looks: Arc::new(Semaphore::new(LOOKS_AT_ONCE)),
             shares: config.shares,
             peer_limits: config.peer_limits,
             show_names: config.show_names,
@@ -165,6 +170,7 @@ pub struct Handle {
     jobs: Arc<Jobs>,
     library: Arc<Library>,
     planning: Arc<Semaphore>,
+    looks: Arc<Semaphore>,
     shares: Shares,
     peer_limits: PeerLimits,
     show_names: bool,
@@ -184,11 +190,28 @@ impl Handle {
 
     /// Runs what may read a volume's file, on a blocking thread; at most [`PLANS_AT_ONCE`] run at a
     /// time. `None` if the master is gone.
-    pub(crate) async fn with_library<T: Send + 'static>(
+    pub(crate) async fn reading<T: Send + 'static>(
         &self,
         run: impl FnOnce(&Library) -> T + Send + 'static,
     ) -> Option<T> {
-        let place = self.planning.clone().acquire_owned().await.ok()?;
+        self.with_library(&self.planning, run).await
+    }
+
+    /// Runs what looks at folders or writes a piece of an upload, on a blocking thread; at most
+    /// [`LOOKS_AT_ONCE`] run at a time. `None` if the master is gone.
+    pub(crate) async fn looking<T: Send + 'static>(
+        &self,
+        run: impl FnOnce(&Library) -> T + Send + 'static,
+    ) -> Option<T> {
+        self.with_library(&self.looks, run).await
+    }
+
+    async fn with_library<T: Send + 'static>(
+        &self,
+        places: &Arc<Semaphore>,
+        run: impl FnOnce(&Library) -> T + Send + 'static,
+    ) -> Option<T> {
+        let place = places.clone().acquire_owned().await.ok()?;
         let library = self.library.clone();
         let done = tokio::task::spawn_blocking(move || {
             let _place = place;

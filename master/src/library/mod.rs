@@ -40,9 +40,9 @@ const NAMES_LISTED: usize = 8;
 const MOST_FILES: usize = 10_000;
 
 /// Endings of names that make a file of the folder a volume. Data files beside a header have others.
-const ENDINGS: [&str; 12] = [
-    ".nrrd", ".nhdr", ".mha", ".mhd", ".nii", ".nii.gz", ".vti", ".tif", ".tiff", ".npy", ".mgz",
-    ".mrc",
+const ENDINGS: [&str; 19] = [
+    ".nrrd", ".nhdr", ".mha", ".mhd", ".nii", ".nii.gz", ".vti", ".vtk", ".tif", ".tiff", ".npy",
+    ".npz", ".mgh", ".mgz", ".mrc", ".map", ".ccp4", ".hdr", ".dcm",
 ];
 
 /// Description of a volume, without its samples.

@@ -41,7 +41,7 @@ pub(super) async fn describe(
 ) -> Result<wire::DescribeVolumeResponse, Status> {
     let choice = convert::volume_choice_from_wire(request.volume)?;
     let viewer = handle.viewer(peer);
-    let described = handle.with_library(move |library| {
+    let described = handle.reading(move |library| {
         let served = library.describe(&choice, viewer)?;
         let name = library.name_of(served.info.digest, viewer);
         Ok((served, name))
@@ -69,7 +69,7 @@ pub(super) async fn list(
     let wire::ListVolumesRequest { page_size, page_token } = request;
     let wanted = convert::page_from_wire(page_size, &page_token)?;
     let viewer = handle.viewer(peer);
-    let listed = handle.with_library(move |library| library.list(viewer)).await;
+    let listed = handle.looking(move |library| library.list(viewer)).await;
     let listed = listed.ok_or_else(ending)?;
     // Entries are numbered as they come: one that is added between two pages may repeat another.
     let begin = wanted.after.map_or(0, |after| after as usize + 1).min(listed.len());
@@ -92,7 +92,7 @@ pub(super) async fn put(
     peer: Option<IpAddr>,
 ) -> Result<wire::PutVolumeResponse, Status> {
     let part = convert::upload_from_wire(request)?;
-    let taken = handle.with_library(move |library| match part {
+    let taken = handle.looking(move |library| match part {
         UploadPart::Begin(header) => library.begin_upload(*header, peer),
         UploadPart::Chunk { digest, offset, data } => library.add_chunk(digest, offset, &data),
     });
@@ -108,7 +108,7 @@ pub(super) async fn remove(
     peer: Option<IpAddr>,
 ) -> Result<wire::RemoveVolumeResponse, Status> {
     let (viewer, of_jobs) = (handle.viewer(peer), handle.clone());
-    let removed = handle.with_library(move |library| {
+    let removed = handle.looking(move |library| {
         library.remove(&request.name, viewer, |digest| of_jobs.is_drawn(digest))
     });
     removed.await.ok_or_else(ending)?.map_err(|e| volume_status(&e))?;

@@ -116,5 +116,5 @@ fn pair_errors_name_file_field_and_remedy() {
     let mut colours = analyze(false, 128, [4, 3, 2]);
     colours[0..4].copy_from_slice(&348u32.to_le_bytes());
     let e = open(&[("a.hdr", &colours), ("a.img", &samples)], "a.hdr").unwrap_err();
-    assert!(e.contains("datatype: 128 is RGB colours"), "{e}");
+    assert!(e.contains("datatype: a voxel is 3 colours (RGB)"), "{e}");
 }

@@ -1,7 +1,7 @@
 //! The volumes of a master, by name and digest.
 //!
 //! A volume comes from one of three places: the master was started with it, it is a file of the
-//! folder of volumes, or a client put it there ([`uploads`]). Files are read when a request needs
+//! folder of volumes, or a client put it there (`uploads`). Files are read when a request needs
 //! them. Their samples stay while memory lasts: the volume that was unused for longest goes first and
 //! is read again when it is needed. So jobs keep digests, and whoever needs samples asks for them
 //! here, by digest.

@@ -72,6 +72,10 @@ const AGAIN: Duration = Duration::from_millis(100);
 /// all attempts, one call in a million fails.
 const MOST_DAMAGED: u32 = 20;
 
+/// Streams that were reset and are remembered: of all calls that a program drops within a second, a
+/// hundred bytes each.
+const RESET_STREAMS: usize = 4096;
+
 /// Longest such wait, whatever the master asks for.
 const LONGEST_AGAIN: Duration = Duration::from_secs(2);
 
@@ -114,6 +118,11 @@ impl Client {
             .initial_stream_window_size(1 << 20)
             .initial_connection_window_size(4 << 20)
             .max_frame_size(64 * 1024)
+            // Watches that are dropped, and calls, are reset, and their frames may still be on the way.
+            // HTTP/2 forgets all but so many reset streams (50 by default), takes frames of forgotten
+            // ones for errors, and closes the connection after 1,024 errors.
+            .http2_max_concurrent_reset_streams(RESET_STREAMS)
+            .http2_max_local_error_reset_streams(None)
             .http2_keep_alive_interval(Duration::from_secs(20))
             .keep_alive_timeout(Duration::from_secs(20));
         // The endpoint's own limit ends with TCP; a peer that takes the connection and says

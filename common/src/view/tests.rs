@@ -134,3 +134,20 @@ proptest! {
         }
     }
 }
+
+/// Long voxels would lie in thousands of thin sheets, which takes hours and gigabytes.
+#[test]
+fn steps_that_are_too_unlike_are_refused_with_the_number_of_sheets() {
+    let oblique = camera(0.8, 0.5, CameraProjection::Ortho { height: 90.0 });
+    let view = |ratio: f64, quality: &Quality| {
+        let l = Lattice::from_spacing([64; 3], [1.0, 1.0, 1.0 / ratio]);
+        View::new(&l, &oblique, [64, 64], quality)
+    };
+    assert!(view(100.0, &Quality::default()).is_ok());
+    let e = view(10_000.0, &Quality::default()).unwrap_err();
+    assert_eq!(e.field, "thickness");
+    assert!(e.problem.contains("sheets, and at most 1024 are drawn; resample"), "{}", e.problem);
+    // The thinnest sheets on an even lattice stay.
+    let thin = Quality { thickness: 1.0 / 64.0, ..Quality::default() };
+    assert!(view(1.0, &thin).is_ok());
+}

@@ -157,6 +157,13 @@ impl RenderRequest {
         let given =
             self.path.turntable.is_none_or(|t| t.height.or(t.target.map(|_| 0.0)).is_some())
                 && !self.path.wants_framing();
+        if refused.field == "thickness" && large >= 10.0 * small {
+            return Some(Fail::failed(format!(
+                "spacing: samples are {small:e} apart along one axis and {large:e} along another, and \
+                 sheets are as thin as the smaller: {}",
+                refused.problem
+            )));
+        }
         if large < 1000.0 * small
             || given
             || !["target", "eye", "height"].contains(&&*refused.field)

@@ -16,7 +16,7 @@ const PROGRAM_BYTES: u64 = 24 << 20;
 const THREAD_BYTES: u64 = 6 << 20;
 
 /// Memory that directories, tables, stalled regions and holes come to take beside all that: 16 transfer
-/// functions of lidc0314_ct (512 x 512 x 267) left some 160 MiB that were not bricks, with two threads.
+/// functions of lidc0314_ct (512 x 512 x 267) left some 130 MiB that were not bricks, with two threads.
 /// No more than [`REST_SHARE`] of a small limit is kept for it.
 const REST_BYTES: u64 = 128 << 20;
 

@@ -100,7 +100,7 @@ pub enum ClientError {
     /// The master has no such volume, can't read it, or does not take it.
     #[error("{message}")]
     Volume {
-        /// What is wrong.
+        /// Reason of the status.
         reason: Reason,
         /// The master's message, for people, with the remedy.
         message: String,

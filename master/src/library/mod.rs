@@ -77,7 +77,7 @@ impl ServedVolume {
 pub struct Unreadable {
     /// One line for people: file, problem and remedy.
     pub reason: String,
-    /// Whether it is larger than was allowed.
+    /// Whether the samples exceed the allowed bytes, so that freeing memory may help.
     pub is_too_large: bool,
 }
 
@@ -85,13 +85,13 @@ pub struct Unreadable {
 pub type ReadFile =
     Arc<dyn Fn(&Path, u64) -> Result<(Volume, Orientation), Unreadable> + Send + Sync>;
 
-/// What a [`Library`] is made of.
+/// Settings of a [`Library`].
 pub struct LibraryConfig {
     /// Volume that the master is started with. It always stays in memory.
     pub given: Option<(Arc<Volume>, Orientation)>,
     /// Folder whose files are volumes.
     pub folder: Option<PathBuf>,
-    /// Where volumes of clients go; `None` refuses them.
+    /// Folder and quota of uploads; `None` refuses uploads.
     pub uploads: Option<UploadConfig>,
     /// Bytes of samples in memory, beside those of `given`.
     pub memory_bytes: u64,
@@ -123,12 +123,12 @@ pub enum VolumeError {
     /// The master takes no volumes.
     #[error("{0}")]
     Refused(String),
-    /// What was uploaded is not what was announced.
+    /// The digest of the uploaded samples differs from the announced one.
     #[error("{0}")]
     Damaged(String),
 }
 
-/// Who asks for volumes: decides which names are told.
+/// Caller of the library. Decides which names it is told.
 #[derive(Clone, Copy, Debug)]
 pub struct Viewer {
     /// Address of the caller; `None`: this process.
@@ -193,7 +193,7 @@ struct Entry {
     problem: Option<String>,
 }
 
-/// What changes when a file is replaced.
+/// Size and modification time of a file: a replaced file has others.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Stamp {
     bytes: u64,

@@ -33,7 +33,7 @@ const WHOLE: &str = "volume";
 /// Ending of files of uploads in progress.
 const PART: &str = "part";
 
-/// Where volumes of clients go.
+/// Folder and quota of uploaded volumes.
 #[derive(Clone, Debug)]
 pub struct UploadConfig {
     /// Folder for their files; it is made if it is missing.
@@ -42,7 +42,7 @@ pub struct UploadConfig {
     pub quota_bytes: u64,
 }
 
-/// How far an upload is.
+/// State of an upload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Progress {
     /// Bytes of samples that are there.

@@ -120,7 +120,7 @@ pub struct Hints {
     pub max_bytes: Option<u64>,
     /// Which volume of a file with several; the first by default.
     pub pick: Pick,
-    /// What readers leave beside a volume; each opening has its own, so leave the default.
+    /// Side results of reading, filled by the reader. Each opening needs a fresh default.
     pub beside: Beside,
 }
 

@@ -78,7 +78,7 @@ pub(crate) struct Members<R: BufRead> {
     packing: Packing,
     /// `None` after the end.
     decoder: Option<Decoder<R>>,
-    /// Whether the current stream follows another and has given nothing yet.
+    /// Whether the current stream is not the first and has returned no bytes yet.
     fresh: bool,
     notes: Notes,
 }

@@ -174,7 +174,7 @@ fn canonical_field(name: &str) -> String {
 /// An interpreted header.
 struct Header {
     layout: Layout,
-    /// Which part of the samples is read, if not all.
+    /// Part of the samples that is read; `None` reads all.
     part: Option<Part>,
     notes: Vec<String>,
     lattice: Lattice,

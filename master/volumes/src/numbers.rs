@@ -104,10 +104,10 @@ impl FileNumbers {
     }
 }
 
-/// What the readers of one volume leave beside it, shared by all of them.
+/// Side results of reading one volume. Clones share them.
 #[derive(Clone, Debug, Default)]
 pub struct Beside {
-    /// Whether numbers that codes round are kept.
+    /// Whether the file's own numbers are kept where codes (u16 or f32) would round them.
     keep: bool,
     left: Arc<Mutex<Left>>,
 }

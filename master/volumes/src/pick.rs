@@ -34,7 +34,8 @@ pub(crate) struct Axis {
     /// What lies along it, for notes: `times`, or `along axis 3`.
     pub(crate) name: String,
     pub(crate) size: u64,
-    /// Whether a voxel is all of these numbers, so that the first of them is no volume.
+    /// Whether the axis holds the components of each voxel (colours, vectors): its first entry alone is no
+    /// volume.
     pub(crate) of_voxel: bool,
 }
 

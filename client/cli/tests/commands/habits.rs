@@ -1,4 +1,4 @@
-//! What people type without reading first: the second command, names of files, figures, grids.
+//! Defaults and shorthands of `render`: numbered output folders, formats by file name, figures, grids.
 
 use crate::program::{good, names, run, slabcast, text};
 use std::path::Path;

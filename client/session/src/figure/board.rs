@@ -46,7 +46,7 @@ pub struct Board {
     /// sRGB of marks, and of their halos.
     ink: [f64; 3],
     halo: [f64; 3],
-    /// How much of each pixel the marks cover that were drawn since the last halo.
+    /// Coverage of each pixel, 0 to 1, by annotations that have no halo yet.
     cover: Vec<f32>,
     /// Pixels of `cover` that aren't zero: left, top, right, bottom.
     dirty: [usize; 4],

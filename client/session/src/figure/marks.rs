@@ -1,5 +1,5 @@
-//! What the marks of each frame say: lengths and letters by its camera, colours by the transfer
-//! function.
+//! Computes a frame's annotations: the length of its scale bar in mm and its orientation letters from
+//! the camera, its colour bar from the transfer function.
 
 use super::bar::{millimetres, number, round_below, ticks};
 use super::{Board, Figure, Place};

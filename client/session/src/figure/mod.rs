@@ -1,8 +1,8 @@
-//! What a figure needs over the picture: scale bar, colour bar, letters of orientation, caption.
+//! Annotations drawn over a finished picture: scale bar, colour bar, orientation letters, caption.
 //!
-//! [`Figure`] is what the user asks for; it travels in a picture's provenance. [`Marker`] knows what
-//! the marks of each frame say. [`Board`] puts them over finished pixels, which stay as they are
-//! elsewhere.
+//! [`Figure`] holds the user's flags and is stored in a picture's provenance. [`Marker`] computes the
+//! text and lengths of a frame's annotations. [`Board`] draws them; pixels under no annotation don't
+//! change.
 
 mod bar;
 mod board;

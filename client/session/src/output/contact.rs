@@ -35,7 +35,7 @@ impl Names {
         self.0.get(number as usize).copied().flatten()
     }
 
-    /// Whether all of these frames have one.
+    /// Returns whether every frame of the range has a name.
     pub(crate) fn all_of(&self, frames: &Range<u64>) -> bool {
         frames.clone().all(|n| self.get(n).is_some())
     }

@@ -4,7 +4,7 @@
 //! gets that name when ffmpeg has ended well. Ctrl-C does not reach it (it has a process group of
 //! its own): the video ends with the frames that there are.
 //!
-//! What the command says beside the codec:
+//! Arguments of the ffmpeg command besides the codec:
 //!
 //! - `setparams`: Y4M can't say that the colours are sRGB in a BT.709 matrix. Untagged, players and
 //!   ffmpeg's own conversion guess, and red is off by 5 of 255.
@@ -113,7 +113,7 @@ pub(super) struct Encoder {
     /// Gone when dropped, unless the video ended well.
     file: Option<NamedTempFile>,
     child: Child,
-    /// What ffmpeg says on stderr.
+    /// Thread that reads ffmpeg's stderr; returns its text.
     said: Option<JoinHandle<String>>,
 }
 

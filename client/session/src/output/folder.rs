@@ -26,7 +26,7 @@ pub(crate) struct Folder {
 pub(crate) struct Wanted {
     /// Numbers of the frames.
     pub(crate) frames: Range<u64>,
-    /// Whether they are a part of a path, whose other frames may be in the folder.
+    /// Whether `frames` is a range of a longer path. Other frames of the path in the folder then stay.
     pub(crate) part: bool,
     /// Stem and extension of the file names.
     pub(crate) names: (&'static str, &'static str),

@@ -13,7 +13,7 @@ pub struct Grid {
     behind: [u8; 3],
     /// Pictures and their names.
     frames: Vec<(Frame, String)>,
-    /// What made the whole of it: comes with the first frame.
+    /// Provenance of the grid as JSON: that of its first frame.
     provenance: String,
 }
 

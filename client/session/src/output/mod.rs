@@ -85,7 +85,7 @@ impl Frame {
     }
 }
 
-/// What a picture's file holds beside its pixels.
+/// Metadata of a picture's file.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Inside<'a> {
     /// Provenance as JSON; nothing is written where it is empty.

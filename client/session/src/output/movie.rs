@@ -18,7 +18,7 @@ pub(super) struct Movie {
     frames: u64,
 }
 
-/// Where its bytes go.
+/// Destination of a movie's bytes: a file, ffmpeg, or a pipe.
 pub(super) enum Sink {
     /// Not begun: the file is made with the first frame, so that a run that fails before has
     /// nothing to clean up.

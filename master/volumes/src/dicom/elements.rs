@@ -68,7 +68,7 @@ pub(super) enum Pixels {
     Native {
         /// Bytes of the element.
         bytes: u64,
-        /// Whether they are words of 16 bits (VR OW), whose bytes the byte order turns.
+        /// Whether the pixels are 16-bit words (VR OW), whose bytes are swapped in big-endian files.
         words: bool,
     },
     /// Encoded, in fragments.
@@ -91,7 +91,7 @@ pub(super) struct File {
     pub(super) pixels: Pixels,
     /// Reader at the first byte of the pixels.
     pub(super) rest: Box<dyn BufRead>,
-    /// What is said of each of several frames.
+    /// Functional groups of an enhanced file: shared, and of each frame.
     pub(super) groups: Groups,
     /// Place of the pixels, or of the first item of fragments; `None` inside deflate.
     pub(super) pixels_at: Option<u64>,

@@ -178,7 +178,7 @@ impl Parameters {
     }
 }
 
-/// What a context has learnt.
+/// Statistics of a context: A, B, C and N of ITU-T T.87, section A.2.
 #[derive(Clone, Copy)]
 struct Context {
     /// Sum of the errors' sizes.

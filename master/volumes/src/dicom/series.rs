@@ -105,7 +105,7 @@ pub(crate) struct SeriesChoice<'a> {
     pub(crate) series: Option<&'a str>,
     /// A slice of it.
     pub(crate) file: Option<&'a Path>,
-    /// Which of its times or echoes.
+    /// Choice among the times or echoes of the series.
     pub(crate) pick: Pick,
 }
 

@@ -193,7 +193,7 @@ enum Kind {
     Half,
 }
 
-/// What the header says of an array.
+/// Header of an array: number type, byte order, order of axes and shape.
 #[derive(Debug, PartialEq)]
 struct Array {
     kind: Kind,

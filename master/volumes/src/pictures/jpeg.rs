@@ -114,7 +114,7 @@ pub(crate) fn is_whole(bytes: &[u8]) -> bool {
     }
 }
 
-/// What a frame's header says (SOF, section B.2.2 of ITU-T T.81).
+/// Frame header of a JPEG (SOF, ITU-T T.81 section B.2.2).
 #[derive(Debug, PartialEq)]
 pub(crate) struct Frame {
     /// Number of the coding process: 0 baseline, 1 extended, 2 progressive, 3 lossless.

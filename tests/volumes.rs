@@ -5,24 +5,14 @@
 mod processes;
 
 use processes::{Process, exit_within, slabcast};
-use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Output, Stdio};
 use std::time::Duration;
 
 /// Starts a master of the folder `scans` that takes uploads, at `address`.
 fn master(dir: &Path, address: &str, more: &[&str]) -> (Process, String) {
-    let args = ["master", "--listen", address, "--volumes", "scans", "--uploads", "uploads"];
-    let mut child = slabcast(dir, &[&args[..], more].concat())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .expect("the master starts");
-    let mut line = String::new();
-    let out = child.stdout.take().expect("piped");
-    BufReader::new(out).read_line(&mut line).expect("a line");
-    let address = line.trim().strip_prefix("listening on ").expect(&line).to_string();
-    (Process(child), address)
+    let folders = ["--volumes", "scans", "--uploads", "uploads"];
+    processes::master_with(dir, address, &[&folders[..], more].concat())
 }
 
 fn run(dir: &Path, args: &[&str]) -> Output {

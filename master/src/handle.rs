@@ -264,18 +264,15 @@ impl Handle {
         }
         // Whom the driver would turn away costs no check.
         let _checking = self.jobs.reserve(request.held_bytes(), peer, self.peer_limits.jobs)?;
-        let place = self.planning.clone().acquire_owned().await.map_err(|_| SubmitError::Gone)?;
-        let (library, hooks) = (self.library.clone(), self.hooks.clone());
-        let (viewer, shares) = (self.viewer(peer), self.shares);
-        let planned = tokio::task::spawn_blocking(move || {
-            let _place = place;
+        let (viewer, shares, hooks) = (self.viewer(peer), self.shares, self.hooks.clone());
+        let planned = self.reading(move |library| {
             caught("checking the request", || {
                 hooks.reach(Stage::Plan);
                 let OpenVolume { served, volume } = library.open(&request.volume, viewer)?;
                 Plan::new(request, &served, &volume, &shares).map_err(SubmitError::from)
             })
         });
-        let plan = planned.await.map_err(|_| SubmitError::Gone)?;
+        let plan = planned.await.ok_or(SubmitError::Gone)?;
         let plan = Box::new(plan.map_err(|e| SubmitError::Panicked(e.to_string()))??);
         let (reply, answer) = oneshot::channel();
         if self.inbox.send(Event::Submit { plan, peer, reply }).await.is_err() {

@@ -79,8 +79,12 @@ pub(crate) fn exit_within(child: &mut Child, limit: Duration) -> Option<i32> {
 
 /// Starts a master of `volume` at a free port. Returns it with its address.
 pub(crate) fn master(dir: &Path, volume: &str, more: &[&str]) -> (Process, String) {
-    let args = ["master", "--listen", "127.0.0.1:0", "--volume", volume];
-    let mut child = slabcast(dir, &[&args[..], more].concat())
+    master_with(dir, "127.0.0.1:0", &[&["--volume", volume], more].concat())
+}
+
+/// Starts a master with these flags that listens at an address. Returns it with its address.
+pub(crate) fn master_with(dir: &Path, listen: &str, flags: &[&str]) -> (Process, String) {
+    let mut child = slabcast(dir, &[&["master", "--listen", listen], flags].concat())
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
         .spawn()

@@ -56,6 +56,23 @@ pub(crate) enum Number {
 }
 
 impl Number {
+    /// Returns the type that NumPy calls `name` (`u1`, `i2`, `f8`), as in .npy files and Zarr 2.
+    pub(crate) fn from_numpy(name: &str) -> Option<Number> {
+        Some(match name {
+            "u1" => Number::U8,
+            "i1" => Number::I8,
+            "u2" => Number::U16,
+            "i2" => Number::I16,
+            "u4" => Number::U32,
+            "i4" => Number::I32,
+            "u8" => Number::U64,
+            "i8" => Number::I64,
+            "f4" => Number::F32,
+            "f8" => Number::F64,
+            _ => return None,
+        })
+    }
+
     /// Returns the size of a number in bytes.
     pub(crate) fn bytes(self) -> u64 {
         match self {

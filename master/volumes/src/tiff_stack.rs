@@ -18,7 +18,7 @@ use crate::raw::RawHints;
 use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
 use crate::source::Source;
 use crate::units::steps_in_mm;
-use crate::unpack::wrapped;
+use crate::unpack::{copy_on, wrapped};
 use as_stored::AsStored;
 use description::{Description, Slices, Writer};
 use slabcast_common::volume::{Lattice, Volume};
@@ -655,10 +655,7 @@ impl Read for Stack {
         if self.consumed == self.band.len() && !self.fill().map_err(wrapped)? {
             return Ok(0);
         }
-        let n = (self.band.len() - self.consumed).min(buf.len());
-        buf[..n].copy_from_slice(&self.band[self.consumed..self.consumed + n]);
-        self.consumed += n;
-        Ok(n)
+        Ok(copy_on(&self.band, &mut self.consumed, buf))
     }
 }
 

@@ -58,6 +58,15 @@ impl Encoding {
     }
 }
 
+/// Copies bytes of `piece` from `consumed` on into `buf`, as many as fit. Returns their number, by which
+/// `consumed` grows.
+pub(crate) fn copy_on(piece: &[u8], consumed: &mut usize, buf: &mut [u8]) -> usize {
+    let n = (piece.len() - *consumed).min(buf.len());
+    buf[..n].copy_from_slice(&piece[*consumed..*consumed + n]);
+    *consumed += n;
+    n
+}
+
 /// Wraps a problem in an I/O error, so that it passes through [`Read`].
 pub(crate) fn wrapped(problem: Problem) -> std::io::Error {
     std::io::Error::new(std::io::ErrorKind::InvalidData, problem)

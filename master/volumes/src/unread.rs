@@ -83,9 +83,7 @@ const UNREAD: &[(Mark, &str, &str)] = &[
         "is the header of a VGStudio volume",
         "give its .vol with --dims and --type",
     ),
-    (Begins(b"PVM\n"), "is a PVM volume", "unpack it with pvm2raw, and give --dims and --type"),
-    (Begins(b"PVM2\n"), "is a PVM volume", "unpack it with pvm2raw, and give --dims and --type"),
-    (Begins(b"PVM3\n"), "is a PVM volume", "unpack it with pvm2raw, and give --dims and --type"),
+    (Begins(b"PVM"), "is a PVM volume", "unpack it with pvm2raw, and give --dims and --type"),
     (
         Begins(b"DDS v3"),
         "is a packed PVM volume",

@@ -81,7 +81,7 @@ pub(super) fn unpack(
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::pictures::tests::jpeg;
+    use crate::pictures::tests::{end_scan, jpeg};
 
     /// Encodes a picture without loss (process 14, each difference with a code of five bits).
     pub(crate) fn lossless(pixels: &[u16], columns: u16, precision: u8, predictor: u8) -> Vec<u8> {
@@ -124,17 +124,7 @@ pub(crate) mod tests {
                 }
             }
         }
-        while !bits.len().is_multiple_of(8) {
-            bits.push('1');
-        }
-        for byte in bits.as_bytes().chunks(8) {
-            let byte = u8::from_str_radix(std::str::from_utf8(byte).unwrap(), 2).unwrap();
-            out.push(byte);
-            if byte == 0xff {
-                out.push(0);
-            }
-        }
-        out.extend([0xff, 0xd9]);
+        end_scan(&mut out, bits);
         out
     }
 

@@ -330,6 +330,23 @@ impl Array {
     }
 }
 
+/// Returns the refusal of a type that is not a number, which `descr` names `name` after the byte order.
+fn unread_type(descr: &str, name: &str) -> Problem {
+    let what = match name.chars().next() {
+        Some('O') => "Python objects, which can run programs",
+        Some('c') => "complex numbers",
+        Some('U' | 'S' | 'a') => "text",
+        Some('M' | 'm') => "times",
+        Some('[') => "records of several fields",
+        _ => "no type that is read",
+    };
+    Problem::unsupported(
+        "descr",
+        format!("{} is {what}", quoted(descr)),
+        "save plain numbers, for instance numpy.save('one.npy', a.astype('float32'))",
+    )
+}
+
 /// Returns type and byte order of a `descr` such as `<f4`.
 fn number_of(descr: &str) -> Result<(Kind, Endian), Problem> {
     let (order, name) = match descr.split_at_checked(1) {
@@ -341,34 +358,11 @@ fn number_of(descr: &str) -> Result<(Kind, Endian), Problem> {
         "=" if cfg!(target_endian = "big") => Endian::Big,
         _ => Endian::Little,
     };
-    let kind = Kind::Number(match name {
-        "b1" | "?" | "u1" => Number::U8,
-        "i1" => Number::I8,
-        "u2" => Number::U16,
-        "i2" => Number::I16,
-        "u4" => Number::U32,
-        "i4" => Number::I32,
-        "u8" => Number::U64,
-        "i8" => Number::I64,
-        "f4" => Number::F32,
-        "f8" => Number::F64,
-        "f2" => return Ok((Kind::Half, endian)),
-        _ => {
-            let what = match name.chars().next() {
-                Some('O') => "Python objects, which can run programs",
-                Some('c') => "complex numbers",
-                Some('U' | 'S' | 'a') => "text",
-                Some('M' | 'm') => "times",
-                Some('[') => "records of several fields",
-                _ => "no type that is read",
-            };
-            return Err(Problem::unsupported(
-                "descr",
-                format!("{} is {what}", quoted(descr)),
-                "save plain numbers, for instance numpy.save('one.npy', a.astype('float32'))",
-            ));
-        }
-    });
+    let kind = match name {
+        "b1" | "?" => Kind::Number(Number::U8),
+        "f2" => Kind::Half,
+        _ => Kind::Number(Number::from_numpy(name).ok_or_else(|| unread_type(descr, name))?),
+    };
     Ok((kind, endian))
 }
 

@@ -14,7 +14,7 @@ use crate::limit::ByteCap;
 use crate::raw::RawHints;
 use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
 use crate::source::{Notes, Source};
-use crate::unpack::wrapped;
+use crate::unpack::{copy_on, wrapped};
 use slabcast_common::volume::{Lattice, Volume};
 use std::collections::VecDeque;
 use std::io::Read;
@@ -274,10 +274,7 @@ impl Read for Stack {
         if self.consumed == self.rows.len() && !self.fill().map_err(wrapped)? {
             return Ok(0);
         }
-        let n = (self.rows.len() - self.consumed).min(buf.len());
-        buf[..n].copy_from_slice(&self.rows[self.consumed..self.consumed + n]);
-        self.consumed += n;
-        Ok(n)
+        Ok(copy_on(&self.rows, &mut self.consumed, buf))
     }
 }
 

@@ -49,6 +49,13 @@ pub(crate) fn jpeg(colours: bool) -> Vec<u8> {
         bits.push_str(&format!("{code}{value:0size$b}0"));
         (1..components).for_each(|_| bits.push_str("000"));
     }
+    end_scan(&mut out, bits);
+    out
+}
+
+/// Writes the bits of a JPEG's scan, padded with ones and with a zero after each 0xff (ITU-T T.81,
+/// section F.1.2.3), and the end of the image.
+pub(crate) fn end_scan(out: &mut Vec<u8>, mut bits: String) {
     while !bits.len().is_multiple_of(8) {
         bits.push('1');
     }
@@ -60,7 +67,6 @@ pub(crate) fn jpeg(colours: bool) -> Vec<u8> {
         }
     }
     out.extend([0xff, 0xd9]);
-    out
 }
 
 /// Puts files into a folder and opens it.

@@ -155,19 +155,7 @@ impl Array {
         let bad = || kind.bad("an integer or float type such as |u1, <i2 or <f4");
         let text = kind.value.as_str().ok_or_else(bad)?;
         let endian = if text.starts_with('>') { Endian::Big } else { Endian::Little };
-        let number = match text.get(1..).unwrap_or_default() {
-            "u1" => Number::U8,
-            "i1" => Number::I8,
-            "u2" => Number::U16,
-            "i2" => Number::I16,
-            "u4" => Number::U32,
-            "i4" => Number::I32,
-            "u8" => Number::U64,
-            "i8" => Number::I64,
-            "f4" => Number::F32,
-            "f8" => Number::F64,
-            _ => return Err(bad()),
-        };
+        let number = text.get(1..).and_then(Number::from_numpy).ok_or_else(bad)?;
         let grid = meta.required("chunks")?.sizes()?;
         let codecs = Codecs::version_2(meta, endian, grid.len())?;
         // xarray writes the names beside the array.

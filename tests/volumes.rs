@@ -83,6 +83,11 @@ fn two_users_draw_two_volumes_of_one_master_at_a_time_as_they_would_alone() {
         fails(dir, &[&["render", "foot", "-o", "x.png"], &there[..], &VIEW[..]].concat());
     assert_eq!(code, Some(1));
     assert!(said.contains("no volume `foot` here; there are head.nii, knee.nrrd"), "{said}");
+    let file = "scans/foot.nrrd";
+    let (code, said) =
+        fails(dir, &[&["render", file, "-o", "x.png"], &there[..], &VIEW[..]].concat());
+    assert_eq!(code, Some(1));
+    assert!(said.contains("scans/foot.nrrd: file: no such file"), "{said}");
 }
 
 #[test]

@@ -259,9 +259,11 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     result
 }
 
-/// Whether VOLUME is a file, a folder or a formula here, and not the name of a volume at the master.
+/// Returns whether VOLUME means a file, a folder or a formula of this machine, and not a volume of the
+/// master by name. Names have no `/`, so a path to a missing file is reported as one.
 fn is_here(volume: &Path) -> bool {
-    volume.exists() || volume.to_string_lossy().starts_with("formula:")
+    let text = volume.to_string_lossy();
+    volume.exists() || text.contains('/') || text.starts_with("formula:")
 }
 
 /// Returns the volume at the master that the command means. A file is read here, and put there unless

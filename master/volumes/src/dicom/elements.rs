@@ -179,6 +179,10 @@ impl File {
         {
             syntax.explicit = true;
         }
+        // Some programs write the pixels in JPEG and the elements without types, unlike the standard.
+        if part10 && syntax.endian == Endian::Little && !deflated {
+            syntax.explicit = reader.has_types()?.unwrap_or(syntax.explicit);
+        }
         let mut len = len;
         if deflated {
             // The limits on elements and the pixels' own size bound the inflated data.
@@ -298,6 +302,12 @@ impl ElementReader {
         // At a buffer's end the second byte may be missing and reads as 0; the group of meta
         // information lies within the first buffer.
         Ok([chunk.first().copied().unwrap_or(0), chunk.get(1).copied().unwrap_or(0)])
+    }
+
+    /// Returns whether the next element has its type beside its tag; `None` at the end of the file.
+    fn has_types(&mut self) -> Result<Option<bool>, Problem> {
+        let chunk = self.inner.fill_buf().map_err(|e| broken(&e))?;
+        Ok(chunk.get(4..6).map(|kind| kind.iter().all(u8::is_ascii_uppercase)))
     }
 
     pub(super) fn skip(&mut self, bytes: u64) -> Result<(), Problem> {

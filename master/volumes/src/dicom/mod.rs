@@ -9,6 +9,7 @@ mod confine;
 mod elements;
 mod fragments;
 mod frames;
+mod gaps;
 mod jpeg;
 mod jpeg_ls;
 mod rle;

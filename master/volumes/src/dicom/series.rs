@@ -2,6 +2,7 @@
 //! samples.
 
 use super::elements::{File, Packing, Pixels, Tag};
+use super::gaps::{millimetres, missing_after, missing_note};
 use super::wire::Preface;
 use super::{fragments, frames, jpeg, jpeg_ls, rle};
 use crate::error::{OpenErrorKind, Problem, quoted};
@@ -136,14 +137,24 @@ pub(super) fn write(
         let (n, were) = (unread.len(), if unread.len() == 1 { " was" } else { "s were" });
         notes.push(format!("{n} DICOM file{were} left out: {first}"));
     }
-    let preface = arrange(&mut series, &choice.pick, &mut notes)?;
+    let (preface, missing) = arrange(&mut series, &choice.pick, &mut notes)?;
     let read = |slice: &Slice| pixels(slice, preface.number).map_err(|p| in_file(&slice.path, p));
     // After the first byte a problem can't be told in full, and most are those of all slices.
     let mut first = Some(read(&series.slices[0])?);
     preface.write(out).map_err(|e| Problem::io("pipe", &e))?;
-    for slice in &series.slices {
+    let empty = match missing.is_empty() {
+        true => Vec::new(),
+        false => {
+            let [columns, rows, _] = preface.lattice.dims.map(|n| n as usize);
+            f32::NAN.to_le_bytes().repeat(columns * rows)
+        }
+    };
+    for (i, slice) in series.slices.iter().enumerate() {
         let bytes = first.take().map_or_else(|| read(slice), Ok)?;
         out.write_all(&bytes).map_err(|e| Problem::io("pipe", &e))?;
+        for _ in 0..missing.get(i).copied().unwrap_or(0) {
+            out.write_all(&empty).map_err(|e| Problem::io("pipe", &e))?;
+        }
     }
     out.flush().map_err(|e| Problem::io("pipe", &e))
 }
@@ -320,11 +331,13 @@ impl Slice {
                 "convert it, for instance with dcm2niix",
             );
         }
-        if file.short((0x0028, 0x0002)).unwrap_or(1) != 1 {
+        let samples = file.short((0x0028, 0x0002)).unwrap_or(1);
+        if samples != 1 {
+            let photometric = file.text((0x0028, 0x0004)).unwrap_or_default();
             return refuse(
                 "SamplesPerPixel",
-                "is above 1: colours are no volume".into(),
-                "leave it out",
+                format!("is {samples}: a picture in colours ({})", quoted(&photometric)),
+                "leave it out, or save it in shades of grey",
             );
         }
         let has = |tag: Tag, word: &str| file.text(tag).is_some_and(|t| t.contains(word));
@@ -462,8 +475,13 @@ fn leading_number(text: &str) -> Option<f64> {
     longest.filter(|x| x.is_finite())
 }
 
-/// Sorts the slices, checks that they agree, and returns the preface with their lattice.
-fn arrange(series: &mut Series, pick: &Pick, notes: &mut Vec<String>) -> Result<Preface, Problem> {
+/// Sorts the slices, checks that they agree, and returns the preface with their lattice, and how many
+/// slices are missing after each; nothing if none is.
+fn arrange(
+    series: &mut Series,
+    pick: &Pick,
+    notes: &mut Vec<String>,
+) -> Result<(Preface, Vec<u32>), Problem> {
     let name = series.name();
     let mut count = series.slices.len();
     let slices = &mut series.slices;
@@ -504,6 +522,7 @@ fn arrange(series: &mut Series, pick: &Pick, notes: &mut Vec<String>) -> Result<
         ));
     }
     let placed = slices.iter().all(|s| s.place.is_some());
+    let mut missing = Vec::new();
     let lattice = if placed {
         let (_, [row, column]) = first.place.expect("all have one");
         let normal = row.cross(column).normalize_or_zero();
@@ -515,7 +534,11 @@ fn arrange(series: &mut Series, pick: &Pick, notes: &mut Vec<String>) -> Result<
         let gaps: Vec<f64> = slices.windows(2).map(|w| along(&w[1]) - along(&w[0])).collect();
         let (least, most) =
             gaps.iter().fold((f64::INFINITY, 0.0f64), |(a, b), g| (a.min(*g), b.max(*g)));
-        if most > 1.05 * least {
+        missing = missing_after(&gaps);
+        if !missing.is_empty() {
+            notes.push(missing_note(&name, &gaps, &missing, along(&slices[0])));
+            count += missing.iter().sum::<u32>() as usize;
+        } else if most > 1.05 * least {
             notes.push(format!(
                 "the slices of {} are {} to {} mm apart, and are drawn as if they were even; some \
                  may be missing",
@@ -555,14 +578,16 @@ fn arrange(series: &mut Series, pick: &Pick, notes: &mut Vec<String>) -> Result<
         .map_err(|e| Problem::malformed("ImageOrientationPatient", e, "get the series again"))?;
     // One rescale for all slices goes into the value map; several turn all samples into floats.
     let rescale = slices[0].rescale;
-    let float = slices.iter().any(|s| s.rescale != rescale);
-    if float {
+    let several = slices.iter().any(|s| s.rescale != rescale);
+    // Only floats can say that there is no value.
+    let float = several || !missing.is_empty();
+    if several {
         notes.push(
             "each slice has a slope and an intercept of its own; its values became float32".into(),
         );
     }
     let number = if float { Number::F32 } else { common_number(slices.iter().map(|s| s.format)) };
-    Ok(Preface {
+    let preface = Preface {
         name,
         number,
         lattice,
@@ -570,7 +595,8 @@ fn arrange(series: &mut Series, pick: &Pick, notes: &mut Vec<String>) -> Result<
         rescale: if float { [1.0, 0.0] } else { rescale },
         float,
         notes: std::mem::take(notes),
-    })
+    };
+    Ok((preface, missing))
 }
 
 /// Leaves one slice at each place of sorted slices, where all places have as many: the picked time
@@ -627,11 +653,6 @@ fn common_number(formats: impl Iterator<Item = PixelFormat> + Clone) -> Number {
         (..=32, true) => Number::I32,
         (_, true) => Number::I64,
     }
-}
-
-/// Returns a length for people: not 300 digits of one that is out of this world.
-fn millimetres(x: f64) -> String {
-    if x < 1e6 { format!("{x:.3}") } else { format!("{x:.3e}") }
 }
 
 /// Returns the samples of a slice as little-endian numbers: as stored, or rescaled if they are f32.

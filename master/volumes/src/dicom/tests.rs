@@ -96,7 +96,8 @@ pub(crate) fn slice(
     put((0x20, 0x13), "IS", &get("instance", "1"));
     put((0x20, 0x32), "DS", &get("position", &format!("-4\\5\\{z}")));
     put((0x20, 0x37), "DS", &get("orientation", "1\\0\\0\\0\\1\\0"));
-    put((0x28, 2), "US", &short(1));
+    let samples: u16 = String::from_utf8(get("samples", "1")).unwrap().parse().unwrap();
+    put((0x28, 2), "US", &short(samples));
     put((0x28, 4), "CS", &get("photometric", "MONOCHROME2"));
     put((0x28, 8), "IS", &get("frames", "1"));
     put((0x28, 0x10), "US", &short(pixels.len() as u16 / 3));
@@ -270,7 +271,7 @@ fn dicom_errors_name_file_field_and_remedy() {
     let dir = folder(&[("1", good(0.0)), ("2", short)]);
     let e = crate::open(dir.path()).unwrap_err().to_string();
     assert!(e.contains("has 10 bytes, where Rows and Columns want 12; get the whole file"), "{e}");
-    // Gaps are drawn as if they were even, and said.
+    // Gaps that tell no missing slice are drawn as if they were even, and said.
     let dir = folder(&[("1", good(0.0)), ("2", good(1.0)), ("3", good(3.0))]);
     let opened = crate::open_with(dir.path(), &crate::Hints::default()).unwrap();
     assert!(opened.notes[0].contains("1.000 to 2.000 mm apart"), "{:?}", opened.notes);
@@ -281,6 +282,54 @@ fn dicom_errors_name_file_field_and_remedy() {
         Err(e) => e.to_string(),
     };
     assert!(line.len() < 400, "{line}");
+}
+
+#[test]
+fn missing_dicom_slices_are_without_value_and_the_others_keep_their_places() {
+    let s = |z: f64| slice(Syntax::Explicit, "1", z, &pixels(z as i16), &[("intercept", "0")]);
+    let places = [0.0, 1.0, 2.0, 5.0, 6.0, 7.0, 8.0, 9.0];
+    let (values, notes) = read(&places.map(s));
+    assert_eq!(values.len(), 60);
+    for (z, slice) in values.chunks(6).enumerate() {
+        match places.contains(&(z as f64)) {
+            true => assert_eq!(slice[5], z as f64 + 5.0),
+            false => assert!(slice.iter().all(|v| v.is_nan()), "{z}: {slice:?}"),
+        }
+    }
+    let say = "2 slices of `CT 7 thorax` are missing, between 2.000 and 5.000 mm along";
+    assert!(notes[0].contains(say), "{notes:?}");
+    let dir = folder(
+        &places.map(|z| (["0", "1", "2", "", "", "5", "6", "7", "8", "9"][z as usize], s(z))),
+    );
+    let v = crate::open(dir.path()).unwrap();
+    assert_eq!((v.lattice.steps[2], v.file_type.as_str()), (DVec3::Z, "float32"));
+    assert_eq!(v.summary.range(), (0.0, 14.0));
+}
+
+#[test]
+fn dicom_elements_without_types_in_a_jpeg_file_are_read_as_they_are() {
+    // pydicom's SC_rgb_jpeg.dcm: the syntax is JPEG, which has types, and the elements have none.
+    let implicit =
+        slice(Syntax::Implicit, "1", 0.0, &pixels(0), &[("samples", "3"), ("photometric", "RGB")]);
+    let place = implicit.windows(18).position(|w| w == b"1.2.840.10008.1.2\0").unwrap();
+    let mut jpeg = implicit[..place - 8].to_vec();
+    element(&mut jpeg, true, false, (2, 0x10), "UI", b"1.2.840.10008.1.2.4.50");
+    jpeg.extend(&implicit[place + 18..implicit.len() - 20]);
+    jpeg.extend([0xe0, 0x7f, 0x10, 0, 0xff, 0xff, 0xff, 0xff]);
+    jpeg.extend([0xfe, 0xff, 0, 0xe0, 0, 0, 0, 0]);
+    jpeg.extend([0xfe, 0xff, 0, 0xe0, 2, 0, 0, 0, 0xff, 0xd8]);
+    jpeg.extend([0xfe, 0xff, 0xdd, 0xe0, 0, 0, 0, 0]);
+    let dir = folder(&[("a.dcm", jpeg)]);
+    let e = crate::open(dir.path()).unwrap_err().to_string();
+    assert!(e.contains("SamplesPerPixel: is 3: a picture in colours (`RGB`); leave it out"), "{e}");
+    // Types in a file whose syntax has none.
+    let explicit = slice(Syntax::Explicit, "1", 0.0, &pixels(0), &[]);
+    let at = explicit.windows(20).position(|w| w == b"1.2.840.10008.1.2.1\0").unwrap();
+    let mut turned = explicit[..at - 8].to_vec();
+    element(&mut turned, true, false, (2, 0x10), "UI", b"1.2.840.10008.1.2");
+    turned.extend(&explicit[at + 20..]);
+    let dir = folder(&[("a.dcm", turned)]);
+    assert_eq!(crate::open(dir.path()).unwrap().lattice.dims, [3, 2, 1]);
 }
 
 #[test]
@@ -348,7 +397,7 @@ fn dicom_wordings_that_do_not_matter_are_not_refused() {
         ("0", "no distance of slices is given; 1 mm was assumed"),
     ] {
         let (_, notes) = read(&[s(0.0, &[("thickness", thickness)])]);
-        assert_eq!(notes, [say]);
+        assert_eq!(notes[0], say);
     }
     let (values, notes) = read(&[s(0.0, &[]), s(1.0, &[("padding", "8")])]);
     assert_eq!(values.len(), 12);

@@ -188,7 +188,7 @@ impl<R: Read> Read for Halves<R> {
 }
 
 /// Returns the value of an IEEE 754 half; exact.
-fn f32_of_half(half: u16) -> f32 {
+pub(crate) fn f32_of_half(half: u16) -> f32 {
     let sign = u32::from(half & 0x8000) << 16;
     let (exponent, fraction) = (u32::from(half >> 10 & 0x1f), u32::from(half & 0x3ff));
     match (exponent, fraction) {

@@ -10,15 +10,16 @@
 mod as_stored;
 mod description;
 
-use crate::Opened;
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::limit::ByteCap;
-use crate::pick::Pick;
+use crate::pick::{Axis, Kind, Pick};
+use crate::plain::f32_of_half;
 use crate::raw::RawHints;
 use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
 use crate::source::Source;
 use crate::units::steps_in_mm;
 use crate::unpack::{copy_on, wrapped};
+use crate::{Hints, Opened};
 use as_stored::AsStored;
 use description::{Description, Slices, Writer};
 use slabcast_common::volume::{Lattice, Volume};
@@ -49,7 +50,7 @@ pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Opene
     let mut pages = TiffFile::open(source)?;
     let first = pages.page()?;
     let mut description = pages.description(&first)?;
-    let said = description.slices(&pick)?;
+    let said = description.slices(&first.pick_of_pages(pick))?;
     // Pictures after the first of an OME or tifffile file are volumes of their own.
     let several = match description.writer {
         Writer::Ome => description.pictures > 1,
@@ -120,6 +121,7 @@ pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Opene
             let stack = Stack {
                 current: Some(pages),
                 files: VecDeque::new(),
+                pick,
                 page: first,
                 stride: slices.stride,
                 left: slices.count - 1,
@@ -159,10 +161,9 @@ fn too_few(said: Slices, pages: u64) -> Problem {
 pub(crate) fn read_files(
     files: Vec<PathBuf>,
     name: &str,
-    hints: &RawHints,
-    cap: ByteCap,
+    hints: &Hints,
 ) -> Result<Opened, Problem> {
-    let (mut first, mut spacing, mut total) = (None, hints.spacing, 0);
+    let (mut first, mut spacing, mut total) = (None, hints.raw.spacing, 0);
     let mut notes = Vec::new();
     let count = files.len() as u64;
     if count > DIM_MAX {
@@ -175,13 +176,15 @@ pub(crate) fn read_files(
             p
         };
         let source = Source::open(path, "file").map_err(name_file)?;
+        let source = Source { pick: hints.pick, ..source };
         total += source.len;
         let mut file = TiffFile::open(source).map_err(name_file)?;
         let page = file.page().map_err(name_file)?;
         match &first {
             None => {
                 let mut description = file.description(&page).map_err(name_file)?;
-                if let Some(said) = description.slices(&Pick::default()).map_err(name_file)?
+                if let Some(said) =
+                    description.slices(&page.pick_of_pages(hints.pick)).map_err(name_file)?
                     && (said.total > count || said.total != said.count)
                 {
                     return Err(name_file(too_few(said, count)));
@@ -209,6 +212,7 @@ pub(crate) fn read_files(
     let stack = Stack {
         current: None,
         files: files.into(),
+        pick: hints.pick,
         page,
         stride: 1,
         left: 0,
@@ -216,7 +220,7 @@ pub(crate) fn read_files(
         consumed: 0,
         row: page.height,
     };
-    let volume = finish(stack, encoded(total), (page, count, NATIVE), cap, name, spacing)?;
+    let volume = finish(stack, encoded(total), (page, count, NATIVE), hints.cap(), name, spacing)?;
     Ok(Opened { volume, notes })
 }
 
@@ -234,7 +238,7 @@ fn finish(
     let lattice = Lattice::from_spacing(layout.dims, spacing.unwrap_or([1.0; 3]));
     lattice.check().map_err(|e| Problem::malformed("spacing", e, "give it with --spacing"))?;
     let (samples, map) = samples::read(&mut samples, supply, &layout, cap)?;
-    Ok(Volume::new(name, number.name(), false, lattice, samples, map))
+    Ok(Volume::new(name, page.kind(), false, lattice, samples, map))
 }
 
 fn too_many(count: u64) -> Problem {
@@ -260,11 +264,64 @@ struct Page {
     width: u32,
     height: u32,
     number: Number,
-    /// Bits of a pixel in the file.
+    /// Bits of a number in the file.
     bits: u32,
+    /// Numbers of a pixel: 3 or more if it has colours.
+    channels: u32,
+    /// The one of them that is read.
+    channel: u32,
+    /// Whether the channels lie one after another, each a picture of its own.
+    planar: bool,
 }
 
 impl Page {
+    /// Returns whether its numbers are 16-bit floats, which become 32-bit ones.
+    fn is_half(&self) -> bool {
+        self.number == Number::F32 && self.bits == 16
+    }
+
+    /// Returns the bytes of a number as decoded.
+    fn decoded_bytes(&self) -> usize {
+        if self.is_half() { 2 } else { self.number.bytes() as usize }
+    }
+
+    /// Returns the numbers that lie beside each other for each pixel.
+    fn interleaved(&self) -> usize {
+        if self.planar { 1 } else { self.channels as usize }
+    }
+
+    /// Returns the name of the type.
+    fn kind(&self) -> &'static str {
+        if self.is_half() { "float16" } else { self.number.name() }
+    }
+
+    /// Returns the choice among pages: a channel within the pixels is none of them.
+    fn pick_of_pages(&self, pick: Pick) -> Pick {
+        if self.channels > 1 { Pick { channel: None, ..pick } } else { pick }
+    }
+
+    /// Leaves in a decoded band the numbers of the channel that is read, in their type.
+    fn take_channel(&self, band: &mut Vec<u8>) -> Result<(), Problem> {
+        if self.interleaved() == 1 && !self.is_half() {
+            return Ok(());
+        }
+        let (size, pixel) = (self.decoded_bytes(), self.decoded_bytes() * self.interleaved());
+        let at = if self.planar { 0 } else { self.channel as usize * size };
+        let decoded = std::mem::take(band);
+        samples::reserve(band, decoded.len() / pixel * self.number.bytes() as usize)?;
+        for pixel in decoded.chunks_exact(pixel) {
+            let number = &pixel[at..at + size];
+            match self.is_half() {
+                true => {
+                    let half = u16::from_ne_bytes([number[0], number[1]]);
+                    band.extend(f32_of_half(half).to_ne_bytes());
+                }
+                false => band.extend_from_slice(number),
+            }
+        }
+        Ok(())
+    }
+
     fn bytes(&self) -> u64 {
         u64::from(self.width) * u64::from(self.height) * self.number.bytes()
     }
@@ -272,7 +329,11 @@ impl Page {
 
 impl std::fmt::Display for Page {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{} x {} {}", self.width, self.height, self.number.name())
+        write!(f, "{} x {} {}", self.width, self.height, self.kind())?;
+        match self.channels {
+            1 => Ok(()),
+            n => write!(f, " of {n} channels"),
+        }
     }
 }
 
@@ -284,6 +345,7 @@ struct TiffFile {
     len: u64,
     white_is_zero: bool,
     palette: bool,
+    pick: Pick,
 }
 
 impl TiffFile {
@@ -295,10 +357,11 @@ impl TiffFile {
         limits.ifd_value_size = 1 << 20;
         let stream = AsStored::new(source.reader.into_inner(), source.len)
             .map_err(|e| Problem::io("file", &e))?;
+        let pick = source.pick;
         let (white_is_zero, palette) = (stream.white_is_zero, stream.palette);
         let decoder =
             Decoder::new(BufReader::new(stream)).map_err(|e| tiff_problem(&e))?.with_limits(limits);
-        Ok(TiffFile { decoder, band_max_bytes, len: source.len, white_is_zero, palette })
+        Ok(TiffFile { decoder, band_max_bytes, len: source.len, white_is_zero, palette, pick })
     }
 
     /// Moves to the next page that is no thumbnail; false if there is none.
@@ -325,16 +388,33 @@ impl TiffFile {
     /// Returns size and type of the page; fails if it can't be a slice of a volume.
     fn page(&mut self) -> Result<Page, Problem> {
         let (width, height) = self.decoder.dimensions().map_err(|e| tiff_problem(&e))?;
-        let bits = match self.decoder.colortype().map_err(|e| tiff_problem(&e))? {
-            ColorType::Gray(bits) => bits,
-            other => {
+        let (bits, channels, what) = match self.decoder.colortype().map_err(|e| tiff_problem(&e))? {
+            ColorType::Gray(bits) => (bits, 1, ""),
+            ColorType::GrayA(bits) => (bits, 2, "numbers (grey and opacity)"),
+            ColorType::RGB(bits) => (bits, 3, "colours (RGB)"),
+            ColorType::RGBA(bits) => (bits, 4, "colours (RGBA)"),
+            ColorType::CMYK(bits) => (bits, 4, "colours (CMYK)"),
+            ColorType::Multiband { bit_depth, num_samples } => {
+                (bit_depth, u32::from(num_samples).max(1), "channels")
+            }
+            _ => {
                 return Err(Problem::unsupported(
                     "PhotometricInterpretation",
-                    format!("{other:?} is not a grey picture"),
+                    "is of colours that are not read",
                     "save it in shades of grey, one number a pixel",
                 ));
             }
         };
+        let planar = self.decoder.find_tag_unsigned::<u16>(Tag::PlanarConfiguration);
+        let planar = channels > 1 && planar.ok().flatten() == Some(2);
+        let mut channel = 0;
+        if channels > 1 {
+            let axis = Axis::new(Kind::Channel, what, channels.into());
+            let pick = Pick { channel: self.pick.channel, ..Pick::default() };
+            let (at, _) =
+                pick.choose(&[Axis { of_voxel: true, ..axis }], "PhotometricInterpretation")?;
+            channel = at[0] as u32;
+        }
         let format = self.decoder.find_tag_unsigned_vec::<u16>(Tag::SampleFormat);
         let format = format.ok().flatten().and_then(|f| f.first().copied()).unwrap_or(1);
         let number = match (bits, format) {
@@ -347,7 +427,7 @@ impl TiffFile {
             (16, 2) => Number::I16,
             (32, 2) => Number::I32,
             (64, 2) => Number::I64,
-            (32, 3) => Number::F32,
+            (16 | 32, 3) => Number::F32,
             (64, 3) => Number::F64,
             _ => {
                 return Err(Problem::unsupported(
@@ -361,17 +441,22 @@ impl TiffFile {
         Layout::new([width.into(), height.into(), 1], number, Endian::Little, "ImageWidth")?;
         let (chunk_width, chunk_height) = self.decoder.chunk_dimensions();
         let tiled = self.decoder.get_chunk_type() == ChunkType::Tile;
-        if tiled && bits < 8 {
+        if (tiled || channels > 1) && bits < 8 {
             return Err(Problem::unsupported(
                 "BitsPerSample",
-                format!("{bits} bits in tiles are not read"),
+                format!("{bits} bits in tiles or of several channels are not read"),
                 "save it with 8 bits, or in strips",
             ));
         }
         let rows = u64::from(chunk_height.min(height));
         // A tile is decoded beside its band.
         let tile = if tiled { u64::from(chunk_width) * u64::from(chunk_height) } else { 0 };
-        let band = (rows * u64::from(width) + tile).saturating_mul(number.bytes());
+        let page = Page { width, height, number, bits: bits.into(), channels, channel, planar };
+        // The decoded band, and beside it the numbers that are read of it.
+        let decoded = page.decoded_bytes() as u64 * page.interleaved() as u64;
+        let direct = page.interleaved() == 1 && !page.is_half();
+        let beside = if direct { 0 } else { rows * u64::from(width) * number.bytes() };
+        let band = (rows * u64::from(width) + tile).saturating_mul(decoded).saturating_add(beside);
         if chunk_width == 0 || chunk_height == 0 || band > self.band_max_bytes {
             return Err(Problem::new(
                 OpenErrorKind::TooLarge,
@@ -383,7 +468,7 @@ impl TiffFile {
                 "save it with smaller strips or tiles",
             ));
         }
-        Ok(Page { width, height, number, bits: bits.into() })
+        Ok(page)
     }
 
     /// Decodes the band of a page that starts at `row`, in the machine's byte order, and returns
@@ -391,7 +476,7 @@ impl TiffFile {
     fn band(&mut self, page: &Page, row: u32, band: &mut Vec<u8>) -> Result<u32, Problem> {
         let (chunk_width, chunk_height) = self.decoder.chunk_dimensions();
         let rows = chunk_height.min(page.height - row);
-        let size = page.number.bytes() as usize;
+        let size = page.decoded_bytes() * page.interleaved();
         let stride = page.width as usize * size;
         band.clear();
         samples::reserve(band, stride * rows as usize)?;
@@ -400,7 +485,10 @@ impl TiffFile {
             ChunkType::Strip => 1,
             ChunkType::Tile => page.width.div_ceil(chunk_width),
         };
-        let first = row / chunk_height * across;
+        let mut first = row / chunk_height * across;
+        if page.planar {
+            first += page.channel * across * page.height.div_ceil(chunk_height);
+        }
         if page.bits < 8 {
             self.check_chunk(first)?;
             return self.few_bits(page, first, rows, band);
@@ -411,6 +499,7 @@ impl TiffFile {
             let (w, h) = self.decoder.chunk_data_dimensions(index);
             if (w, h) == (page.width, rows) {
                 self.decoder.read_chunk_bytes(index, band).map_err(|e| self.tile_problem(&e))?;
+                page.take_channel(band)?;
                 return Ok(rows);
             }
         }
@@ -432,6 +521,7 @@ impl TiffFile {
                 row[left..left + w * size].copy_from_slice(tile_row);
             }
         }
+        page.take_channel(band)?;
         Ok(rows)
     }
 
@@ -503,7 +593,7 @@ impl TiffFile {
     fn description(&mut self, page: &Page) -> Result<Description, Problem> {
         self.rewind()?;
         match self.decoder.get_tag_ascii_string(Tag::ImageDescription) {
-            Ok(text) => Description::parse(&text, page.width, page.height),
+            Ok(text) => Description::parse(&text, page),
             Err(_) => Ok(Description::default()),
         }
     }
@@ -545,7 +635,7 @@ impl TiffFile {
     /// if the planes can't be there.
     fn planes_start(&mut self, page: &Page, total: u64, len: u64) -> Option<u64> {
         let compression = self.decoder.find_tag_unsigned::<u16>(Tag::Compression).ok()?;
-        if compression.is_some_and(|c| c != 1) {
+        if compression.is_some_and(|c| c != 1) || page.channels > 1 || page.is_half() {
             return None;
         }
         let starts = self.decoder.get_tag_u64_vec(Tag::StripOffsets).ok()?;
@@ -607,6 +697,7 @@ struct Stack {
     current: Option<TiffFile>,
     /// Files not yet opened.
     files: VecDeque<PathBuf>,
+    pick: Pick,
     page: Page,
     /// Pages from one slice to the next of the current file.
     stride: u64,
@@ -634,7 +725,8 @@ impl Stack {
                 }
             } else {
                 let Some(path) = self.files.pop_front() else { return Ok(false) };
-                self.current = Some(TiffFile::open(Source::open(&path, "file")?)?);
+                let source = Source { pick: self.pick, ..Source::open(&path, "file")? };
+                self.current = Some(TiffFile::open(source)?);
             }
             self.row = 0;
         }

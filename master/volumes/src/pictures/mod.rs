@@ -8,13 +8,12 @@
 pub(crate) mod jpeg;
 mod png;
 
-use crate::Opened;
 use crate::error::{OpenErrorKind, Problem, quoted};
-use crate::limit::ByteCap;
-use crate::raw::RawHints;
+use crate::pick::{Axis, Kind, Pick};
 use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
 use crate::source::{Notes, Source};
 use crate::unpack::{copy_on, wrapped};
+use crate::{Hints, Opened};
 use slabcast_common::volume::{Lattice, Volume};
 use std::collections::VecDeque;
 use std::io::Read;
@@ -37,6 +36,17 @@ pub(crate) fn is_png(head: &[u8]) -> bool {
 /// Returns whether the first bytes are JPEG.
 pub(crate) fn is_jpeg(head: &[u8]) -> bool {
     head.starts_with(b"\xff\xd8\xff")
+}
+
+/// Returns width and height of a picture by its first bytes, as far as these tell.
+pub(crate) fn size(head: &[u8]) -> Option<(u32, u32)> {
+    if is_jpeg(head) {
+        let frame = jpeg::Frame::find(head).ok()?;
+        return Some((frame.width.into(), frame.height.into()));
+    }
+    let word = |at: usize| head.get(at..at + 4)?.try_into().ok().map(u32::from_be_bytes);
+    let header = is_png(head) && head.get(12..16) == Some(b"IHDR");
+    header.then(|| Some((word(16)?, word(20)?))).flatten()
 }
 
 /// Checks that a picture of `bytes` bytes may be decoded whole, out of a file of `len` bytes.
@@ -75,9 +85,10 @@ enum Picture {
 
 impl Picture {
     /// Opens a file and reads its header.
-    fn open(path: &Path, notes: &Notes) -> Result<(Picture, u64), Problem> {
+    fn open(path: &Path, pick: Pick, notes: &Notes) -> Result<(Picture, u64), Problem> {
         let mut source = Source::open(path, "file")?;
         source.notes = notes.clone();
+        source.pick = pick;
         let len = source.len;
         let picture = match is_jpeg(source.head()?) {
             true => Picture::Jpeg(jpeg::Jpeg::open(source)?),
@@ -117,18 +128,37 @@ fn colours() -> Problem {
     Problem::unsupported(
         "picture",
         "is in colours: red, green and blue differ",
-        "save the stack in shades of grey, or one of its colours",
+        "take one of them with --channel 0 to 2, or save the stack in shades of grey",
     )
 }
 
-/// Writes the grey of pixels of `channels` numbers of `size` bytes: one, grey and opacity, three
-/// colours, or those and opacity. Returns whether all are opaque.
+/// Returns the number of each pixel that was asked for; `None` asks for the grey. A pixel has
+/// `channels` numbers.
+fn picked(pick: &Pick, channels: usize) -> Result<Option<usize>, Problem> {
+    let axis = Axis { of_voxel: true, ..Axis::new(Kind::Channel, "colours", channels as u64) };
+    if pick.channel.is_none() {
+        pick.choose(&[], "picture")?;
+        return Ok(None);
+    }
+    let (at, _) = pick.choose(&[axis], "picture")?;
+    Ok(Some(at[0] as usize))
+}
+
+/// Writes one number of each pixel of `channels` numbers of `size` bytes: one, grey and opacity, three
+/// colours, or those and opacity. That is the one with index `picked`, or else the grey. Returns
+/// whether nothing is lost: all are opaque.
 fn push_grey(
     pixels: &[u8],
-    channels: usize,
+    (channels, picked): (usize, Option<usize>),
     size: usize,
     out: &mut Vec<u8>,
 ) -> Result<bool, Problem> {
+    if let Some(at) = picked.filter(|at| *at < channels) {
+        for pixel in pixels.chunks_exact(channels * size) {
+            out.extend_from_slice(&pixel[at * size..(at + 1) * size]);
+        }
+        return Ok(true);
+    }
     if channels == 1 {
         out.extend_from_slice(pixels);
         return Ok(true);
@@ -151,9 +181,9 @@ fn push_grey(
 pub(crate) fn read_files(
     files: Vec<PathBuf>,
     name: &str,
-    hints: &RawHints,
-    cap: ByteCap,
+    hints: &Hints,
 ) -> Result<Opened, Problem> {
+    let cap = hints.cap();
     let count = files.len() as u64;
     if count > DIM_MAX {
         return Err(Problem::new(
@@ -167,7 +197,8 @@ pub(crate) fn read_files(
     let (mut first, mut total) = (None, 0);
     for path in &files {
         let shown = quoted(&path.file_name().unwrap_or_default().to_string_lossy());
-        let (picture, len) = Picture::open(path, &notes).map_err(|p| in_file(path, p))?;
+        let (picture, len) =
+            Picture::open(path, hints.pick, &notes).map_err(|p| in_file(path, p))?;
         total += len;
         let (shape, palette) = (picture.shape(), picture.palette().map(<[u8]>::to_vec));
         match &first {
@@ -186,7 +217,7 @@ pub(crate) fn read_files(
     let (shape, _) = first.expect("the caller passes a file");
     let sizes = [shape.width.into(), shape.height.into(), count];
     let layout = Layout::new(sizes, shape.number, Endian::Big, "pictures")?;
-    let lattice = Lattice::from_spacing(layout.dims, hints.spacing.unwrap_or([1.0; 3]));
+    let lattice = Lattice::from_spacing(layout.dims, hints.raw.spacing.unwrap_or([1.0; 3]));
     lattice.check().map_err(|e| Problem::malformed("--spacing", e, "give three lengths"))?;
     let mut stack = Stack {
         current: None,
@@ -195,12 +226,13 @@ pub(crate) fn read_files(
         rows: Vec::new(),
         consumed: 0,
         left: 0,
+        pick: hints.pick,
         notes: notes.clone(),
     };
     // Deflate is denser than JPEG, of which a byte holds some hundred pixels.
     let supply = Supply::deflate("pictures", total);
     let (samples, map) = samples::read(&mut stack, supply, &layout, cap)?;
-    if hints.spacing.is_none() {
+    if hints.raw.spacing.is_none() {
         notes.add("pictures have no spacing; 1 mm was taken (--spacing sets it)");
     }
     let volume = Volume::new(name, shape.number.name(), false, lattice, samples, map);
@@ -233,6 +265,7 @@ struct Stack {
     consumed: usize,
     /// Bytes of the current picture that are still to be decoded.
     left: u64,
+    pick: Pick,
     notes: Notes,
 }
 
@@ -241,7 +274,8 @@ impl Stack {
     fn fill(&mut self) -> Result<bool, Problem> {
         if self.left == 0 {
             let Some(path) = self.files.pop_front() else { return Ok(false) };
-            let (picture, _) = Picture::open(&path, &self.notes).map_err(|p| in_file(&path, p))?;
+            let (picture, _) =
+                Picture::open(&path, self.pick, &self.notes).map_err(|p| in_file(&path, p))?;
             // The file may have changed since the first pass.
             if picture.shape() != self.shape {
                 return Err(differs("a picture", picture.shape(), self.shape));

@@ -117,7 +117,7 @@ fn png_in_colours_is_read_only_if_it_is_grey() {
     let mut red = grey.clone();
     red[15] = 200;
     let e = open(&[("a.png", png((3, 2), (Rgb, Eight), None, &red))]).unwrap_err();
-    assert!(e.contains("`a.png` picture: is in colours: red, green and blue differ; save"), "{e}");
+    assert!(e.contains("`a.png` picture: is in colours: red, green and blue differ; take"), "{e}");
 }
 
 #[test]
@@ -171,6 +171,39 @@ fn stack_of_unequal_or_broken_pictures_is_refused_by_name() {
     let whole = jpeg(false);
     let e = open(&[("a.jpg", whole[..whole.len() - 5].to_vec())]).unwrap_err();
     assert!(e.contains("`a.jpg` picture: is truncated or damaged"), "{e}");
+}
+
+#[test]
+fn one_colour_of_a_stack_of_pictures_is_taken_by_channel() {
+    let folder = tempfile::tempdir().unwrap();
+    let rgb: Vec<u8> = (0..6).flat_map(|i| [i, 10 + i, 20 + i]).collect();
+    let wide: Vec<u8> = rgb.iter().flat_map(|b| [*b, 1]).collect();
+    let rgba: Vec<u8> = (0..6).flat_map(|i| [i, 10 + i, 20 + i, 30 + i]).collect();
+    let put = |name: &str, bytes: &[u8]| std::fs::write(folder.path().join(name), bytes).unwrap();
+    let open = |channel| {
+        let pick = crate::Pick { channel: Some(channel), ..crate::Pick::default() };
+        let hints = crate::Hints { pick, ..crate::Hints::default() };
+        crate::open_with(folder.path(), &hints).map(|opened| opened.volume)
+    };
+    for n in ["1.png", "2.png"] {
+        put(n, &png((3, 2), (Rgb, Sixteen), None, &wide));
+    }
+    assert_eq!(
+        open(2).unwrap().samples,
+        Samples::U16((0..12).map(|i| (20 + i % 6) << 8 | 1).collect())
+    );
+    let e = open(3).unwrap_err().to_string();
+    assert!(e.contains("--channel: 3 is not there: the file has 3 channels; give 0 to 2"), "{e}");
+    for n in ["1.png", "2.png"] {
+        put(n, &png((3, 2), (Rgba, Eight), None, &rgba));
+    }
+    assert_eq!(bytes(&open(3).unwrap())[..6], [30, 31, 32, 33, 34, 35]);
+    let jpegs = tempfile::tempdir().unwrap();
+    std::fs::write(jpegs.path().join("a.jpg"), jpeg(true)).unwrap();
+    let pick = crate::Pick { channel: Some(1), ..crate::Pick::default() };
+    let hints = crate::Hints { pick, ..crate::Hints::default() };
+    let v = crate::open_with(jpegs.path(), &hints).unwrap().volume;
+    assert!(bytes(&v).chunks(16).all(|row| row[..8] == [50; 8] && row[8..] == [200; 8]));
 }
 
 #[test]

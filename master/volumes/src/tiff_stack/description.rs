@@ -1,6 +1,7 @@
 //! Descriptions that ImageJ, OME and tifffile write into a file's first page: which pages are
 //! slices of one channel and time, and how far apart samples are.
 
+use super::Page;
 use crate::error::{Problem, quoted};
 use crate::pick::{Axis, Kind, Pick};
 use crate::units::Step;
@@ -43,15 +44,23 @@ pub(super) struct Slices {
 }
 
 impl Description {
-    /// Parses the description of a page of `width` by `height`.
-    pub(super) fn parse(text: &str, width: u32, height: u32) -> Result<Description, Problem> {
+    /// Parses the description of a page.
+    pub(super) fn parse(text: &str, page: &Page) -> Result<Description, Problem> {
         let text = text.trim();
         if text.starts_with("ImageJ=") {
             imagej(text)
         } else if let Some(pixels) = element(text, "Pixels").filter(|_| text.contains("OME")) {
-            ome(text, pixels)
+            let mut description = ome(text, pixels)?;
+            // OME counts the colours within a page among the channels.
+            let within = u64::from(page.channels);
+            for (name, size) in &mut description.axes {
+                if name == "channels" && size.is_multiple_of(within) {
+                    *size /= within;
+                }
+            }
+            Ok(description)
         } else if text.starts_with('{') && text.contains("shape") {
-            shaped(text, width.into(), height.into())
+            shaped(text, page)
         } else {
             Ok(Description::default())
         }
@@ -232,7 +241,8 @@ fn ome(text: &str, pixels: &str) -> Result<Description, Problem> {
 }
 
 /// tifffile writes `{"shape": [2, 6, 10, 12], "axes": "CZYX"}`, the slowest axis first.
-fn shaped(text: &str, width: u64, height: u64) -> Result<Description, Problem> {
+fn shaped(text: &str, page: &Page) -> Result<Description, Problem> {
+    let (width, height) = (u64::from(page.width), u64::from(page.height));
     let after = |key: &str| {
         let at = ["\"", "'"].iter().find_map(|q| text.split_once(&format!("{q}{key}{q}")))?;
         Some(at.1.trim_start().strip_prefix(':')?.trim_start())
@@ -252,6 +262,18 @@ fn shaped(text: &str, width: u64, height: u64) -> Result<Description, Problem> {
     if shape.len() > 2 && shape.ends_with(&[height, width, 1]) {
         shape.pop();
         letters.pop();
+    }
+    // Nor are the colours within a page, which lie in its pixels or before its rows.
+    let colours = u64::from(page.channels);
+    let within = match page.planar {
+        true => shape.ends_with(&[colours, height, width]).then(|| shape.len() - 3),
+        false => shape.ends_with(&[height, width, colours]).then(|| shape.len() - 1),
+    };
+    if let Some(within) = within.filter(|_| colours > 1) {
+        shape.remove(within);
+        if within < letters.len() {
+            letters.remove(within);
+        }
     }
     // Another program may have changed the pages and kept the text.
     if !shape.ends_with(&[height, width]) || shape.contains(&0) {

@@ -64,12 +64,106 @@ fn tiff_sample_types_and_imagej_and_ome_spacing() {
     let e = open(one::<colortype::Gray8>(1, 1, &[1], "ImageJ=1\nimages=9\n")).unwrap_err();
     assert!(e.to_string().contains("9 pictures, and 1 pages"), "{e}");
     let e = open(one::<colortype::RGB8>(1, 1, &[1, 2, 3], "")).unwrap_err().to_string();
-    assert!(e.contains("RGB(8) is not a grey picture; save it in shades of grey"), "{e}");
+    assert!(
+        e.contains(
+            "a voxel is 3 colours (RGB), not one number; take one of them with --channel 0 to 2"
+        ),
+        "{e}"
+    );
     let all = pages(2, Compression::Lzw);
     for cut in [8, 20, 60, all.len() / 2, all.len() - 1] {
         let e = open(all[..cut].to_vec()).unwrap_err();
         assert!(matches!(e.kind, OpenErrorKind::Damaged), "{cut}: {e}");
     }
+}
+
+/// Pages of 5 x 4 pixels of three colours: 3 i, 3 i + 1, 3 i + 2.
+pub(crate) fn coloured(count: u16, text: &str) -> Vec<u8> {
+    let mut out = Cursor::new(Vec::new());
+    let mut tiff = TiffEncoder::new(&mut out).unwrap().with_compression(Compression::Lzw);
+    for page in 0..count {
+        let data: Vec<u16> = (0..60).map(|i| page * 60 + i).collect();
+        let mut image = tiff.new_image::<colortype::RGB16>(5, 4).unwrap();
+        if page == 0 && !text.is_empty() {
+            image.encoder().write_tag(Tag::ImageDescription, text).unwrap();
+        }
+        image.rows_per_strip(3).unwrap();
+        image.write_data(&data).unwrap();
+    }
+    out.into_inner()
+}
+
+#[test]
+fn one_colour_of_a_tiff_is_taken_by_channel() {
+    let blue = Pick { channel: Some(2), ..Pick::default() };
+    let want = Samples::U16((0..60).map(|i| 3 * i + 2).collect());
+    for text in [
+        "",
+        r#"{"shape": [3, 4, 5, 3], "axes": "ZYXS"}"#,
+        "ImageJ=1.53\nimages=3\nslices=3\n",
+        &ome("", "\"", "DimensionOrder=\"XYCZT\" SizeC=\"3\" SizeZ=\"3\" SizeT=\"1\""),
+    ] {
+        let (v, _) = picked(coloured(3, text), blue).unwrap_or_else(|e| panic!("{text}: {e}"));
+        assert_eq!((v.lattice.dims, &v.samples), ([5, 4, 3], &want), "{text}");
+        let e = noted(coloured(3, text)).unwrap_err().to_string();
+        assert!(e.contains("a voxel is 3 colours (RGB)"), "{text}: {e}");
+    }
+    let dir = tempfile::tempdir().unwrap();
+    for name in ["1.tif", "2.tif"] {
+        std::fs::write(dir.path().join(name), coloured(1, "")).unwrap();
+    }
+    let hints = crate::Hints { pick: blue, ..crate::Hints::default() };
+    let v = crate::open_with(dir.path(), &hints).unwrap().volume;
+    assert_eq!(v.samples, Samples::U16((0..40).map(|i| 3 * (i % 20) + 2).collect()));
+    let e = picked(coloured(1, ""), Pick { channel: Some(3), ..Pick::default() }).unwrap_err();
+    assert!(e.to_string().contains("--channel: 3 is not there: the file has 3 channels"), "{e}");
+}
+
+#[test]
+fn tiff_of_channels_one_after_another_and_of_half_floats_is_read() {
+    // Planes of 4 x 3 bytes; as half floats, 0x3c00 is 1 and each more a 1024th.
+    let mut planar = by_hand("", 3, 1, 1, 2);
+    let edit = |bytes: &mut Vec<u8>, tag: u16, kind: u16, count: u32, value: u32| {
+        let head = [&tag.to_le_bytes()[..], &kind.to_le_bytes()].concat();
+        let at = bytes.windows(4).rposition(|w| w == head).unwrap();
+        bytes[at + 4..at + 8].copy_from_slice(&count.to_le_bytes());
+        bytes[at + 8..at + 12].copy_from_slice(&value.to_le_bytes());
+    };
+    // PlanarConfiguration in place of RowsPerStrip, which then is the whole page.
+    edit(&mut planar, 277, 3, 1, 3);
+    let at = planar.windows(4).rposition(|w| w == [0x16, 1, 3, 0]).unwrap();
+    planar[at] = 0x1c;
+    planar[at + 8] = 2;
+    // StripByteCounts (279) must come before 284.
+    let entries = planar[at..at + 24].to_vec();
+    planar[at..at + 12].copy_from_slice(&entries[12..]);
+    planar[at + 12..at + 24].copy_from_slice(&entries[..12]);
+    for (tag, values) in [(273u16, [10u32, 22, 34]), (279, [12; 3])] {
+        let place = planar.len() as u32;
+        planar.extend(values.iter().flat_map(|n| n.to_le_bytes()));
+        edit(&mut planar, tag, 4, 3, place);
+    }
+    let place = planar.len() as u32;
+    planar.extend([8, 0, 8, 0, 8, 0]);
+    edit(&mut planar, 258, 3, 3, place);
+    for channel in 0..3 {
+        let pick = Pick { channel: Some(channel), ..Pick::default() };
+        let (v, _) = picked(planar.clone(), pick).unwrap();
+        let first = 12 * channel as u8;
+        assert_eq!(v.samples, Samples::U8((first..first + 12).collect()), "{channel}");
+    }
+    let mut half = by_hand("", 2, 2, 2, 1);
+    // SampleFormat in place of SamplesPerPixel, and the last tag.
+    while let Some(at) = half.windows(4).position(|w| w == [0x15, 1, 3, 0]) {
+        let entries = half[at + 12..at + 36].to_vec();
+        half[at..at + 24].copy_from_slice(&entries);
+        half[at + 24..at + 36].copy_from_slice(&[0x53, 1, 3, 0, 1, 0, 0, 0, 3, 0, 0, 0]);
+    }
+    let data = half.windows(6).position(|w| w == [0, 0, 1, 0, 2, 0]).unwrap();
+    (0..24).for_each(|i| half[data + 2 * i + 1] = 0x3c);
+    let (v, _) = noted(half).unwrap();
+    assert_eq!((v.lattice.dims, v.file_type.as_str()), ([4, 3, 2], "float16"));
+    assert_eq!(v.samples, Samples::F32((0..24).map(|i| 1.0 + i as f32 / 1024.0).collect()));
 }
 
 #[test]

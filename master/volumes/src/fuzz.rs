@@ -39,6 +39,13 @@ pub(crate) fn bzip2(bytes: &[u8]) -> Vec<u8> {
     bz.finish().expect("memory takes all")
 }
 
+pub(crate) fn xz(bytes: &[u8]) -> Vec<u8> {
+    let options = lzma_rust2::XzOptions::with_preset(1);
+    let mut xz = lzma_rust2::XzWriter::new(Vec::new(), options).expect("a preset");
+    xz.write_all(bytes).expect("memory takes all");
+    xz.finish().expect("memory takes all")
+}
+
 pub(crate) fn base64(bytes: &[u8]) -> Vec<u8> {
     let digits = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let group = |g: &[u8]| {
@@ -306,6 +313,7 @@ fn nrrd_mutants_neither_panic_nor_hang_nor_fill_memory() {
          space: left-posterior-superior\nspace directions: (-1,0,0) (0,0,2) (0.1,-1,0)\n\
          space origin: (1,2,3)\nkinds: domain domain domain\n\n",
         "type: double\ndimension: 3\nsizes: 3 2 2\nendian: little\nencoding: raw\n\
+         axis mins: 0 0 nan\naxis maxs: 3 2 2\ncenters: node cell cell\n\
          key:=value\nbyte skip: -1\n\n",
         "type: int\ndimension: 4\nsizes: 1 4 3 2\nspace: RAS\nendian: little\n\
          space directions: none (1,0,0) (0,1,0) (0,0,1)\nencoding: raw\nline skip: 0\n\n",
@@ -438,12 +446,13 @@ fn metaimage_mutants_neither_panic_nor_hang_nor_fill_memory() {
 
 #[test]
 fn vti_mutants_neither_panic_nor_hang_nor_fill_memory() {
-    use crate::vti::tests::{WAYS, vti};
+    use crate::vti::tests::{WAYS, packed, vti};
     let data: Vec<u8> = (0..30).map(|i| i * 7).collect();
     let seeds: Vec<Vec<u8>> = WAYS
         .iter()
         .flat_map(|way| [vti(*way, "UInt8", &data, 4, false), vti(*way, "UInt8", &data, 8, true)])
         .collect();
+    let seeds = [seeds, packed(&data)].concat();
     survive_files("vti", Path::new("/nonexistent"), |rng| seed_or_mutant(rng, &seeds));
 }
 
@@ -461,6 +470,21 @@ fn tiff_mutants_neither_panic_nor_hang_nor_fill_memory() {
     .map(|compression| pages(2, compression))
     .collect();
     survive_files("tiff", Path::new("/nonexistent"), |rng| seed_or_mutant(rng, &seeds));
+}
+
+#[test]
+fn tiff_mutants_in_colours_neither_panic_nor_hang_nor_fill_memory() {
+    let seeds = [crate::tiff_stack::tests::coloured(2, "")];
+    survive(
+        "tiff in colours",
+        mutants(),
+        |rng| seed_or_mutant(rng, &seeds),
+        |bytes| {
+            let pick = crate::Pick { channel: Some(1), ..crate::Pick::default() };
+            let hints = Hints { pick, ..Hints::default() };
+            read(Source::from_bytes(bytes), Path::new("/nonexistent"), "a.tif", &hints).map(Some)
+        },
+    );
 }
 
 /// Readers of one file from front to back, each plain and inside gzip.
@@ -603,7 +627,7 @@ fn jpeg_ls_mutants_neither_panic_nor_hang_nor_fill_memory() {
 #[cfg(feature = "zarr")]
 #[test]
 fn zarr_mutants_neither_panic_nor_hang_nor_fill_memory() {
-    use crate::zarr::tests::{pyramid, sharded, version_2};
+    use crate::zarr::tests::{nested, pyramid, sharded, version_2};
     // In memory if possible, so that the disk is not what is measured.
     let folder = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap();
     // Each array with the file that is mutated.
@@ -612,7 +636,7 @@ fn zarr_mutants_neither_panic_nor_hang_nor_fill_memory() {
         let path = folder.path().join(dir).join(file);
         seeds.push((path.clone(), std::fs::read(path).unwrap()));
     };
-    for how in ["zlib", "zstd", "lz4", "blosc"] {
+    for how in ["zlib", "zstd", "lz4", "blosc", "bz2", "lzma"] {
         version_2(&folder.path().join(how), how, false, false);
         keep(how, ".zarray");
         keep(how, "0/1/0");
@@ -620,6 +644,9 @@ fn zarr_mutants_neither_panic_nor_hang_nor_fill_memory() {
     sharded(&folder.path().join("shard"));
     keep("shard", "zarr.json");
     keep("shard", "c/0/0/0");
+    nested(&folder.path().join("nested"));
+    keep("nested", "zarr.json");
+    keep("nested", "c/0/0/0");
     pyramid(&folder.path().join("pyramid"));
     keep("pyramid", ".zattrs");
     keep("pyramid", "0/.zarray");

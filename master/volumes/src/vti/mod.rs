@@ -1,8 +1,9 @@
-//! Reader of VTK's XML image data (`.vti`): ascii, base64 and appended, plain or in zlib blocks.
+//! Reader of VTK's XML image data (`.vti`): ascii, base64 and appended, plain or in blocks of zlib,
+//! lz4 or xz.
 //!
 //! With raw appended data the file is no valid XML, so it is read as a stream of tags. One array is
-//! drawn: the active scalars of the points, else the first array with one number a point, else with
-//! one a cell. Points and cells that VTK's masks hide (`vtkGhostType`, `vtkValidPointMask`) become NaN.
+//! drawn: the one asked for, else the active scalars of the points, else the first array with one number
+//! a point, else with one a cell. Points and cells that VTK's masks hide (`vtkGhostType`, `vtkValidPointMask`) become NaN.
 //!
 //! Binary data begin with a header of 32- or 64-bit numbers (`header_type`). Plain data have the
 //! number of bytes; compressed data have the number of blocks, the size of a whole one, the size of
@@ -17,7 +18,7 @@ use crate::limit::ByteCap;
 use crate::samples::{self, Endian, Layout, Number, Supply};
 use crate::source::{BUFFER_BYTES, Notes, Source, Stream};
 use crate::unpack::{Base64, Encoding};
-use blocks::Blocks;
+use blocks::{Blocks, Compressor};
 use glam::{DMat3, DVec3};
 use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -34,18 +35,19 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
     text.starts_with(b"<VTKFile") || text.starts_with(b"<?xml") && named()
 }
 
-/// Reads a volume from the start of a source.
-pub(crate) fn read(source: Source, name: &str) -> Result<Volume, Problem> {
+/// Reads a volume from the start of a source; `dataset` names its array.
+pub(crate) fn read(source: Source, name: &str, dataset: Option<&str>) -> Result<Volume, Problem> {
+    source.pick.choose(&[], "content")?;
     let (len, cap, notes) = (source.len, source.cap.clone(), source.notes.clone());
     let stream = SharedStream(Arc::new(Mutex::new(source.reader.into_inner())));
-    let arrays = Arrays::find(stream.reader(0)?)?;
+    let arrays = Arrays::find(stream.reader(0)?, dataset)?;
     let Arrays { file, image, drawn, names, .. } = &arrays;
     let (array, place) = drawn;
-    if names.len() > 1 {
+    if names.len() > 1 && dataset.is_none() {
         let others: Vec<String> =
             names.iter().filter(|n| **n != array.name).take(8).map(|n| quoted(n)).collect();
         notes.add(format!(
-            "the array {} was read, and {} {} not",
+            "the array {} was read, and {} {} not (--dataset takes another)",
             quoted(&array.name),
             others.join(", "),
             if others.len() == 1 { "was" } else { "were" }
@@ -151,8 +153,8 @@ struct Arrays {
 }
 
 impl Arrays {
-    /// Goes through the tags up to the appended data.
-    fn find(reader: BufReader<Box<dyn Stream>>) -> Result<Arrays, Problem> {
+    /// Goes through the tags up to the appended data. `dataset` names the array to draw.
+    fn find(reader: BufReader<Box<dyn Stream>>, dataset: Option<&str>) -> Result<Arrays, Problem> {
         let mut tags = Tags::new(reader);
         let (mut file, mut image, mut section) = (None, None, None);
         let (mut drawn, mut names, mut masks): (Option<(Array, Place)>, _, _) =
@@ -185,7 +187,7 @@ impl Arrays {
                     }
                     let found = match is_mask {
                         true => Some(section.array(&tag)?),
-                        false if drawn.is_none() => section.select(&tag)?,
+                        false if drawn.is_none() => section.select(&tag, dataset)?,
                         false => None,
                     };
                     let Some(array) = found else { continue };
@@ -226,6 +228,18 @@ impl Arrays {
                 Ok(Arrays { file, image, drawn, names, masks, appended })
             }
             (None, ..) => Err(Problem::malformed("VTKFile", "is missing", RESAVE)),
+            (Some(_), Some(_), None) if dataset.is_some() => {
+                let list: Vec<String> = names.iter().take(6).map(|n| quoted(n)).collect();
+                let list = if list.is_empty() { "no arrays".into() } else { list.join(", ") };
+                Err(Problem::malformed(
+                    "--dataset",
+                    format!(
+                        "there is no {} with one number a point or cell among {list}",
+                        quoted(dataset.unwrap_or_default())
+                    ),
+                    "name one of them",
+                ))
+            }
             _ => Err(Problem::unsupported(
                 "DataArray",
                 "there is none with one number a point or cell",
@@ -266,8 +280,8 @@ struct File {
     endian: Endian,
     /// Bytes of a number in a data header, 4 or 8.
     header_word_bytes: usize,
-    /// Whether binary data are zlib blocks.
-    compressed: bool,
+    /// How the blocks of binary data are compressed, if they are.
+    compressor: Option<Compressor>,
 }
 
 impl File {
@@ -289,14 +303,16 @@ impl File {
             Some("UInt64") => 8,
             Some(_) => return Err(tag.bad("header_type", "UInt32 or UInt64")),
         };
-        let compressed = match tag.get("compressor") {
-            None | Some("") => false,
-            Some("vtkZLibDataCompressor") => true,
+        let compressor = match tag.get("compressor") {
+            None | Some("") => None,
+            Some("vtkZLibDataCompressor") => Some(Compressor::Zlib),
+            Some("vtkLZ4DataCompressor") => Some(Compressor::Lz4),
+            Some("vtkLZMADataCompressor") => Some(Compressor::Xz),
             Some(_) => {
-                return Err(tag.bad("compressor", "vtkZLibDataCompressor, or leave it out"));
+                return Err(tag.bad("compressor", "VTK's ZLib, LZ4 or LZMA, or left out"));
             }
         };
-        Ok(File { endian, header_word_bytes, compressed })
+        Ok(File { endian, header_word_bytes, compressor })
     }
 }
 
@@ -377,10 +393,13 @@ impl Section {
         Section { scalars, cells }
     }
 
-    /// Returns the array of a `DataArray` tag if it is the one to draw.
-    fn select(&self, tag: &Tag) -> Result<Option<Array>, Problem> {
+    /// Returns the array of a `DataArray` tag if it is the one to draw. `dataset` names that.
+    fn select(&self, tag: &Tag, dataset: Option<&str>) -> Result<Option<Array>, Problem> {
         let name = tag.get("Name").unwrap_or_default();
         let one = is_single(tag);
+        if let Some(asked) = dataset {
+            return (one && asked == name).then(|| self.array(tag)).transpose();
+        }
         match &self.scalars {
             // Active scalars that are no volume say nothing.
             Some(scalars) if scalars != name && !MASKS.contains(&scalars.as_str()) => {
@@ -517,7 +536,7 @@ fn read_array(
             "get the file again, or correct header_type",
         )
     };
-    if !file.compressed {
+    let Some(compressor) = file.compressor else {
         let bytes = word(&mut data)?;
         if bytes != need {
             return Err(differs(bytes));
@@ -529,7 +548,7 @@ fn read_array(
             _ => Supply::Encoded { name: "base64", bytes: left, ratio: 1 },
         };
         return samples::read(&mut data.take(need), supply, layout, cap);
-    }
+    };
     let [count, size, last] = [word(&mut data)?, word(&mut data)?, word(&mut data)?];
     let whole = if last == 0 { count } else { count.saturating_sub(1) };
     let total = whole.saturating_mul(size).saturating_add(last);
@@ -551,8 +570,8 @@ fn read_array(
     if bytes > left {
         return Err(samples::truncated(bytes, left));
     }
-    let mut blocks = Blocks::new(Box::new(data), packed, size, last);
-    samples::read(&mut blocks, Supply::deflate("zlib", bytes), layout, cap)
+    let mut blocks = Blocks::new(compressor, Box::new(data), packed, [size, last]);
+    samples::read(&mut blocks, compressor.supply(bytes), layout, cap)
 }
 
 /// Binary data, raw or in base64.

@@ -1,7 +1,7 @@
 //! Tests with VTI files written in every data format of VTK.
 
 use super::*;
-use crate::fuzz::{base64, zlib};
+use crate::fuzz::{base64, xz, zlib};
 use std::path::Path;
 
 /// Data format of a test's array.
@@ -22,15 +22,24 @@ pub(crate) const WAYS: [Way; 7] = [
     Way::Appended { packed: true, base64: true },
 ];
 
-/// An array with its header, `word` bytes a number, in blocks of 16 bytes where packed.
-fn binary(data: &[u8], packed: bool, base: bool, word: usize, big: bool) -> Vec<u8> {
+/// A block as VTK's compressor of this name writes it.
+fn block(compressor: &str, data: &[u8]) -> Vec<u8> {
+    match compressor {
+        "LZ4" => lz4_flex::block::compress(data),
+        "LZMA" => xz(data),
+        _ => zlib(data),
+    }
+}
+
+/// An array with its header, `word` bytes a number, in blocks of 16 bytes if it has a compressor.
+fn binary(data: &[u8], compressor: Option<&str>, base: bool, word: usize, big: bool) -> Vec<u8> {
     let number = |n: usize| match big {
         true => (n as u64).to_be_bytes()[8 - word..].to_vec(),
         false => (n as u64).to_le_bytes()[..word].to_vec(),
     };
     let (mut head, mut body) = (Vec::new(), Vec::new());
-    if packed {
-        let blocks: Vec<Vec<u8>> = data.chunks(16).map(zlib).collect();
+    if let Some(name) = compressor {
+        let blocks: Vec<Vec<u8>> = data.chunks(16).map(|part| block(name, part)).collect();
         head.extend([number(blocks.len()), number(16), number(data.len() % 16)].concat());
         for block in blocks {
             head.extend(number(block.len()));
@@ -40,7 +49,7 @@ fn binary(data: &[u8], packed: bool, base: bool, word: usize, big: bool) -> Vec<
         head = number(data.len());
         body = data.to_vec();
     }
-    match (base, packed) {
+    match (base, compressor.is_some()) {
         (false, _) => [head, body].concat(),
         (true, true) => [base64(&head), base64(&body)].concat(),
         (true, false) => base64(&[head, body].concat()),
@@ -49,9 +58,22 @@ fn binary(data: &[u8], packed: bool, base: bool, word: usize, big: bool) -> Vec<
 
 /// A file of bytes `data` as 5 x 3 x 2 samples of `kind`, with another array before it.
 pub(crate) fn vti(way: Way, kind: &str, data: &[u8], word: usize, big: bool) -> Vec<u8> {
+    vti_by("ZLib", way, kind, data, word, big)
+}
+
+/// Files of `data` in blocks of lz4 and xz.
+pub(crate) fn packed(data: &[u8]) -> Vec<Vec<u8>> {
+    let ways = [WAYS[2], WAYS[4], WAYS[6]];
+    let files = |name| ways.map(|way| vti_by(name, way, "UInt8", data, 4, false));
+    ["LZ4", "LZMA"].into_iter().flat_map(files).collect()
+}
+
+/// Like [`vti`]; a packed array by VTK's compressor of this name.
+fn vti_by(name: &str, way: Way, kind: &str, data: &[u8], word: usize, big: bool) -> Vec<u8> {
     let order = if big { "BigEndian" } else { "LittleEndian" };
     let packed = matches!(way, Way::Inline { packed: true } | Way::Appended { packed: true, .. });
-    let compressor = if packed { " compressor=\"vtkZLibDataCompressor\"" } else { "" };
+    let by = |packed: bool| packed.then_some(name);
+    let compressor = if packed { &format!(" compressor=\"vtk{name}DataCompressor\"") } else { "" };
     let head = format!(
         "<?xml version=\"1.0\"?>\n<!-- made <here> -->\n<VTKFile type=\"ImageData\" \
          version=\"1.0\" byte_order=\"{order}\" header_type=\"UInt{}\"{compressor}>\n<ImageData \
@@ -71,14 +93,14 @@ pub(crate) fn vti(way: Way, kind: &str, data: &[u8], word: usize, big: bool) -> 
             (array("v", "format='ascii'", text.join(" ").as_bytes()), Vec::new())
         }
         Way::Inline { packed } => {
-            let data = [b"\n  ", &binary(data, packed, true, word, big)[..], b"\n"].concat();
+            let data = [b"\n  ", &binary(data, by(packed), true, word, big)[..], b"\n"].concat();
             (array("v", "format=\"binary\"", &data), Vec::new())
         }
         Way::Appended { packed, base64 } => {
             let array = array("v", "format=\"appended\" offset=\"8\"", b"");
             let encoding = if base64 { "base64" } else { "raw" };
             let tag = format!("<AppendedData encoding=\"{encoding}\">\n   _AAAAAAAA");
-            let data = binary(data, packed, base64, word, big);
+            let data = binary(data, by(packed), base64, word, big);
             (array, [tag.as_bytes(), &data, b"\n</AppendedData>"].concat())
         }
     };
@@ -106,6 +128,61 @@ fn vti_data_formats_give_the_same_samples() {
     let wide: Vec<u8> = (0..30u16).flat_map(|i| (i * 300).to_be_bytes()).collect();
     let v = open(vti(WAYS[4], "UInt16", &wide, 4, true)).unwrap();
     assert_eq!(v.samples, Samples::U16((0..30).map(|i| i * 300).collect()));
+}
+
+#[test]
+fn vti_blocks_of_lz4_and_xz_are_read_and_damage_is_named() {
+    let data: Vec<u8> = (0..30).map(|i| i * 7).collect();
+    for file in packed(&data) {
+        assert_eq!(open(file).unwrap().samples, Samples::U8(data.clone()));
+    }
+    let wide: Vec<u8> = (0..30u32).flat_map(|i| (i * 70_000).to_le_bytes()).collect();
+    for name in ["LZ4", "LZMA"] {
+        let file = vti_by(name, WAYS[4], "UInt32", &wide, 8, false);
+        let v = open(file.clone()).unwrap();
+        assert_eq!(v.summary.range(), (0.0, 2_030_000.0), "{name}");
+        let at = file.len() - 70;
+        // lz4 has no checksum.
+        if name == "LZMA" {
+            let mut spoilt = file.clone();
+            spoilt[at] ^= 0xff;
+            let e = open(spoilt).unwrap_err().to_string();
+            assert!(e.contains("of 8: ") && e.contains("get the file again"), "{e}");
+        }
+        let e = open(file[..at].to_vec()).unwrap_err().to_string();
+        assert!(e.contains("truncated"), "{name}: {e}");
+    }
+    // A block that says more than it can hold takes no memory.
+    let file = vti_by("LZ4", WAYS[4], "UInt8", &data, 4, false);
+    let at = file.windows(12).position(|w| w == [2, 0, 0, 0, 16, 0, 0, 0, 14, 0, 0, 0]).unwrap();
+    let large = String::from_utf8_lossy(&file[..at]).replace("1 5 0 2 0 1", "1 1024 1 1024 1 1024");
+    let mut head = file[at..].to_vec();
+    head[..12].copy_from_slice(&[1, 0, 0, 0, 0, 0, 0, 0x40, 0, 0, 0, 0]);
+    let e = open([large.as_bytes(), &head].concat()).unwrap_err().to_string();
+    assert!(e.contains("can't hold so many") || e.contains("size that it can't have"), "{e}");
+}
+
+#[test]
+fn vti_array_is_chosen_by_dataset() {
+    let file = "<VTKFile type=\"ImageData\"><ImageData WholeExtent=\"0 1 0 1 0 1\"><Piece><PointData \
+        Scalars=\"a\"><DataArray type=\"Int8\" Name=\"a\" format=\"ascii\">1 2 3 4 5 6 7 8</DataArray>\
+        <DataArray type=\"Int8\" Name=\"b\" format=\"ascii\">9 8 7 6 5 4 3 2</DataArray></PointData>\
+        <CellData><DataArray type=\"Int8\" Name=\"c\" format=\"ascii\">7</DataArray></CellData></Piece>\
+        </ImageData></VTKFile>";
+    let open = |dataset: Option<&str>| {
+        let dataset = dataset.map(String::from);
+        let hints = crate::Hints { dataset, ..crate::Hints::default() };
+        let source = Source::from_bytes(file.into());
+        let v = crate::read(source, Path::new("."), "a.vti", &hints).map_err(|p| p.to_string())?;
+        Ok::<_, String>(v.summary.map.value(v.samples.code(0)))
+    };
+    assert_eq!(open(None), Ok(1.0));
+    assert_eq!(open(Some("b")), Ok(9.0));
+    assert_eq!(open(Some("c")), Ok(7.0));
+    let e = open(Some("d")).unwrap_err();
+    let say =
+        "--dataset: there is no `d` with one number a point or cell among `a`, `b`, `c`; name";
+    assert!(e.contains(say), "{e}");
 }
 
 #[test]
@@ -146,7 +223,8 @@ fn vti_errors_name_field_and_remedy() {
             appended.replace("offset=\"8\"", "offset=\"0\""),
             "bytes, where the extent and the type want 30",
         ),
-        (appended.replace("vtkZLib", "vtkLZ4"), "VTKFile compressor"),
+        (appended.replace("vtkZLib", "vtkZ"), "VTKFile compressor"),
+        (appended.replace("vtkZLib", "vtkLZ4"), "block 1 of 2: is damaged"),
         (appended.split("<AppendedData").next().unwrap().into(), "AppendedData: is missing"),
     ] {
         let e = open(file.into()).unwrap_err().to_string();
@@ -198,8 +276,8 @@ fn vti_masks_before_or_after_the_array_hide_points_and_cells() {
     let two = file("PointData", &[v, ("Int8", "w", "1 2 3 4")]);
     let source = Source::from_bytes(two.into_bytes());
     let notes = source.notes.clone();
-    read(source, "two.vti").unwrap();
-    assert_eq!(notes.take(), ["the array `v` was read, and `w` was not"]);
+    read(source, "two.vti", None).unwrap();
+    assert_eq!(notes.take(), ["the array `v` was read, and `w` was not (--dataset takes another)"]);
     let masks = file("PointData", &[("UInt8", "vtkGhostType", "0 2 1 3")]);
     let e = open(masks.into_bytes()).unwrap_err().to_string();
     assert!(e.contains("there is none with one number a point or cell"), "{e}");

@@ -6,6 +6,7 @@ use super::json::{self, Json};
 use crate::error::{OpenErrorKind, Problem};
 use crate::limit::ByteCap;
 use crate::numbers::Beside;
+use crate::plain::f32_of_half;
 use crate::samples::{Endian, Number, reserve};
 use crate::source::{Folder, Inside, not_inside};
 use crate::wide;
@@ -48,13 +49,24 @@ pub(super) struct Array {
     pub(super) names: Option<Vec<String>>,
     /// Shape of a chunk file, which holds one chunk or a shard.
     grid: Vec<u64>,
+    /// Type of the samples in memory.
     pub(super) number: Number,
+    /// Name of their type in the file.
+    pub(super) kind: &'static str,
     pub(super) endian: Endian,
     /// Sample in place of missing chunks, little-endian.
     fill: [u8; 8],
     key: ChunkKey,
     codecs: Codecs,
     shard: Option<Shard>,
+}
+
+/// Where a shard lies: its bytes in the file, the index of its first sample, and its shape.
+struct ShardPlace<'a> {
+    at: u64,
+    len: u64,
+    first: Vec<u64>,
+    grid: &'a [u64],
 }
 
 /// How chunk files are named.
@@ -81,9 +93,14 @@ impl Array {
                 "write the array again",
             ));
         }
-        let whole =
-            array.grid.iter().zip(inner).all(|(g, i)| *g > 0 && *i > 0 && g.is_multiple_of(*i));
-        let bytes = inner.iter().try_fold(array.number.bytes(), |n, &s| n.checked_mul(s));
+        let mut whole = array.grid.iter().all(|g| *g > 0);
+        let (mut outer, mut shard) = (&array.grid, array.shard.as_ref());
+        while let Some(Shard { inner, nested, .. }) = shard {
+            let divides = |(g, i): (&u64, &u64)| *i > 0 && g.is_multiple_of(*i);
+            whole &= inner.len() == rank && outer.iter().zip(inner).all(divides);
+            (outer, shard) = (inner, nested.as_deref());
+        }
+        let bytes = inner.iter().try_fold(array.stored_size(), |n, &s| n.checked_mul(s));
         match bytes {
             Some(bytes) if whole && bytes <= CHUNK_MAX_BYTES => Ok(array),
             Some(_) if !whole => Err(Problem::malformed(
@@ -102,9 +119,14 @@ impl Array {
         }
     }
 
+    /// Returns the bytes of a sample in a decoded chunk.
+    fn stored_size(&self) -> u64 {
+        if self.kind == HALF { 2 } else { self.number.bytes() }
+    }
+
     /// Returns the shape that is decoded at a time: a chunk, or an inner chunk of a shard.
     fn inner(&self) -> &[u64] {
-        self.shard.as_ref().map_or(&self.grid, |s| &s.inner)
+        self.shard.as_ref().map_or(&self.grid, |s| s.innermost())
     }
 
     fn version_3(root: &Arc<Folder>, folder: &str, meta: &Json) -> Result<Array, Problem> {
@@ -118,11 +140,10 @@ impl Array {
         }
         let grid = grid.required("configuration")?.required("chunk_shape")?.sizes()?;
         let kind = meta.required("data_type")?;
-        let number = kind
-            .value
-            .as_str()
-            .and_then(number)
-            .ok_or_else(|| kind.bad("an integer or float type such as uint8 or float32"))?;
+        let (number, name) =
+            kind.value.as_str().and_then(number).ok_or_else(|| {
+                kind.bad("bool, an integer or float type such as uint8 or float32")
+            })?;
         let encoding = meta.required("chunk_key_encoding")?;
         let asked = encoding.get("configuration").and_then(|c| c.get("separator"));
         let (prefix, usual) = match encoding.required("name")?.text()? {
@@ -142,6 +163,7 @@ impl Array {
             }),
             grid,
             number,
+            kind: name,
             endian: codecs.endian,
             fill: fill_bytes(meta.get("fill_value"), number)?,
             key: ChunkKey { prefix, separator },
@@ -155,7 +177,11 @@ impl Array {
         let bad = || kind.bad("an integer or float type such as |u1, <i2 or <f4");
         let text = kind.value.as_str().ok_or_else(bad)?;
         let endian = if text.starts_with('>') { Endian::Big } else { Endian::Little };
-        let number = text.get(1..).and_then(Number::from_numpy).ok_or_else(bad)?;
+        let (number, name) = match text.get(1..).ok_or_else(bad)? {
+            "b1" => (Number::U8, BOOL),
+            "f2" => (Number::F32, HALF),
+            name => Number::from_numpy(name).map(|n| (n, n.name())).ok_or_else(bad)?,
+        };
         let grid = meta.required("chunks")?.sizes()?;
         let codecs = Codecs::version_2(meta, endian, grid.len())?;
         // xarray writes the names beside the array.
@@ -168,6 +194,7 @@ impl Array {
             names: attributes.and_then(|a| names(a.get("_ARRAY_DIMENSIONS"))),
             grid,
             number,
+            kind: name,
             endian,
             fill: fill_bytes(meta.get("fill_value"), number)?,
             key: ChunkKey {
@@ -261,6 +288,14 @@ impl Array {
                 let code = |b: &[u8]| le!(u16)(b) ^ 0x8000;
                 (Samples::U16(self.collect(placed, code)?), shifted(-32768.0))
             }
+            // The fill value is a float of 32 bits already.
+            Number::F32 if self.kind == HALF => {
+                let code = |b: &[u8]| match b {
+                    [low, high] => f32_of_half(u16::from_le_bytes([*low, *high])),
+                    b => le!(f32)(b),
+                };
+                wide::without_fillers(self.collect(placed, code)?, beside)?
+            }
             Number::F32 => wide::without_fillers(self.collect(placed, le!(f32))?, beside)?,
             // Their range decides the codes, so all are kept in their type first.
             Number::U32 => wide::compact_integers(self.collect_pieces(placed, le!(u32))?, beside)?,
@@ -310,7 +345,7 @@ impl Array {
         out.resize(samples, code(&self.fill[..size]));
         let layer = |(z, out): (usize, &mut [T])| self.layer(placed, layers.start + z, out, code);
         // A chunk in memory, compressed and decoded.
-        let chunk = 2 * self.inner().iter().product::<u64>() * self.number.bytes();
+        let chunk = 2 * self.inner().iter().product::<u64>() * self.stored_size();
         if chunk * rayon::current_num_threads() as u64 <= CONCURRENT_MAX_BYTES {
             out.par_chunks_mut(nx * ny * depth).enumerate().try_for_each(layer)?;
         } else {
@@ -393,15 +428,37 @@ impl Array {
                 ));
             }
         };
-        let bytes = (self.inner().iter().product::<u64>() * self.number.bytes()) as usize;
         let first: Vec<u64> = cell.iter().zip(&self.grid).map(|(c, g)| c * g).collect();
         let Some(shard) = &self.shard else {
-            let decoded = self.codecs.decode(&mut file, len, bytes)?;
+            let decoded = self.codecs.decode(&mut file, len, self.chunk_bytes())?;
             self.copy(placed, &first, decoded, out, code);
             return Ok(());
         };
-        let index = shard.index(&mut file, len, &self.grid)?;
-        let counts: Vec<u64> = self.grid.iter().zip(&shard.inner).map(|(g, i)| g / i).collect();
+        let place = ShardPlace { at: 0, len, first, grid: &self.grid };
+        self.read_shard(placed, (shard, place), &mut file, layer, &mut |first, decoded| {
+            self.copy(placed, first, decoded, out, code);
+        })
+    }
+
+    /// Returns the bytes of a decoded chunk.
+    fn chunk_bytes(&self) -> usize {
+        (self.inner().iter().product::<u64>() * self.stored_size()) as usize
+    }
+
+    /// Decodes the chunks of a shard that lie in `layer`, and gives each to `take` with the index of its
+    /// first sample. A shard's chunks may be shards.
+    fn read_shard(
+        &self,
+        placed: &Placed,
+        (shard, place): (&Shard, ShardPlace<'_>),
+        file: &mut std::fs::File,
+        layer: &Range<u64>,
+        take: &mut dyn FnMut(&[u64], Vec<u8>),
+    ) -> Result<(), Problem> {
+        let io = |e: std::io::Error| Problem::io("file", &e);
+        let ShardPlace { at, len, first, grid } = place;
+        let index = shard.index(file, (at, len), grid)?;
+        let counts: Vec<u64> = grid.iter().zip(&shard.inner).map(|(g, i)| g / i).collect();
         for (n, (offset, size)) in index.into_iter().enumerate() {
             // The mark of an inner chunk that was never written.
             if (offset, size) == (u64::MAX, u64::MAX) {
@@ -414,7 +471,10 @@ impl Array {
                 rest /= counts[a];
             }
             let wanted = (0..corner.len()).all(|a| match placed.axes {
-                [.., Some(z)] if z == a => layer.contains(&corner[a]) && corner[a] < self.shape[a],
+                [.., Some(z)] if z == a => {
+                    let end = corner[a] + shard.inner[a];
+                    corner[a] < layer.end && layer.start < end && corner[a] < self.shape[a]
+                }
                 axes if axes.contains(&Some(a)) => corner[a] < self.shape[a],
                 _ => (corner[a]..corner[a] + shard.inner[a]).contains(&placed.at[a]),
             });
@@ -429,9 +489,15 @@ impl Array {
                     "get the array again",
                 ));
             }
-            file.seek(SeekFrom::Start(offset)).map_err(io)?;
-            let decoded = self.codecs.decode(&mut (&file).take(size), size, bytes)?;
-            self.copy(placed, &corner, decoded, out, code);
+            if let Some(nested) = &shard.nested {
+                let grid = &shard.inner;
+                let place = ShardPlace { at: at + offset, len: size, first: corner, grid };
+                self.read_shard(placed, (nested, place), file, layer, take)?;
+                continue;
+            }
+            file.seek(SeekFrom::Start(at + offset)).map_err(io)?;
+            let mut body = (&*file).take(size);
+            take(&corner, self.codecs.decode(&mut body, size, self.chunk_bytes())?);
         }
         Ok(())
     }
@@ -446,7 +512,7 @@ impl Array {
         out: &mut [T],
         code: &impl Fn(&[u8]) -> T,
     ) {
-        let size = self.number.bytes() as usize;
+        let size = self.stored_size() as usize;
         if self.endian == Endian::Big {
             decoded.chunks_exact_mut(size).for_each(<[u8]>::reverse);
         }
@@ -510,9 +576,17 @@ fn separator(asked: Option<Json>, usual: char) -> Result<char, Problem> {
     }
 }
 
-/// Returns the type that version 3 calls `name`.
-fn number(name: &str) -> Option<Number> {
-    Number::named(name)
+/// Names of types that are read as others: truth as bytes, 16-bit floats as 32-bit ones.
+const BOOL: &str = "bool";
+const HALF: &str = "float16";
+
+/// Returns the type of samples that version 3 calls `name`, and its name.
+fn number(name: &str) -> Option<(Number, &'static str)> {
+    match name {
+        BOOL => Some((Number::U8, BOOL)),
+        HALF => Some((Number::F32, HALF)),
+        name => Number::named(name).map(|n| (n, n.name())),
+    }
 }
 
 /// Returns the fill value as little-endian bytes of a sample.
@@ -525,7 +599,7 @@ fn fill_bytes(value: Option<Json>, number: Number) -> Result<[u8; 8], Problem> {
         Some("Infinity") => Some(f64::INFINITY),
         Some("-Infinity") => Some(f64::NEG_INFINITY),
         Some(_) => None,
-        None => json.value.as_f64(),
+        None => json.value.as_f64().or(json.value.as_bool().map(|b| f64::from(u8::from(b)))),
     };
     let bad = || json.bad(&format!("a value of {}", number.name()));
     let float = float.ok_or_else(bad)?;

@@ -3,7 +3,8 @@
 use super::blosc;
 use super::json::Json;
 use crate::error::{OpenErrorKind, Problem};
-use crate::samples::{Endian, SKIP_MAX_BYTES};
+use crate::samples::{Endian, Number, SKIP_MAX_BYTES};
+use bzip2::read::MultiBzDecoder;
 use flate2::read::{MultiGzDecoder, ZlibDecoder};
 use ruzstd::decoding::StreamingDecoder;
 use std::fs::File;
@@ -20,6 +21,13 @@ enum Codec {
     Lz4,
     /// A checksum of four bytes at the end.
     Crc32c,
+    Bzip2,
+    /// What Python calls LZMA, in its usual format.
+    Xz,
+    /// Differences of neighbours, in the order of storage.
+    Delta(Number, Endian),
+    /// All first bytes of elements of this size, then all second ones, and so on.
+    Shuffle(u64),
 }
 
 /// The codecs of a chunk. Decoding applies the last one first.
@@ -37,6 +45,8 @@ pub(super) struct Codecs {
 pub(super) struct Shard {
     /// Shape of an inner chunk.
     pub(super) inner: Vec<u64>,
+    /// Layout of an inner chunk that is a shard itself.
+    pub(super) nested: Option<Box<Shard>>,
     /// Whether the index is at the end of the file, not at its start.
     at_end: bool,
     /// Whether a checksum follows the index.
@@ -53,6 +63,11 @@ impl Codecs {
             let name = codec.required("name")?;
             let config = codec.get("configuration");
             let get = |key: &str| config.as_ref().and_then(|c| c.get(key));
+            if let Some(id) = name.text()?.strip_prefix("numcodecs.") {
+                let config = config.as_ref().unwrap_or(&codec);
+                codecs.list.push(Codec::of_numcodecs(id, &name, config)?);
+                continue;
+            }
             match name.text()? {
                 "bytes" | "endian" => match get("endian") {
                     None => {}
@@ -73,10 +88,11 @@ impl Codecs {
                     let config = codec.required("configuration")?;
                     let inner = config.required("chunk_shape")?.sizes()?;
                     let (inside, nested) = Codecs::version_3(&config.required("codecs")?, &inner)?;
-                    if nested.is_some() {
-                        return Err(name.bad("a shard of chunks, not of shards"));
+                    let nested = nested.map(Box::new);
+                    if nested.as_ref().is_some_and(|shard| shard.nested.is_some()) {
+                        return Err(name.bad("a shard of chunks, or of shards of chunks"));
                     }
-                    shard = Some(Shard::from_config(&config, inner)?);
+                    shard = Some(Shard::from_config(&config, inner, nested)?);
                     codecs = inside;
                 }
                 "sharding_indexed" => return Err(name.bad("the only codec")),
@@ -87,13 +103,29 @@ impl Codecs {
                 }
             }
         }
+        // Differences are taken before the bytes have an order, and along the array's own axes.
+        if codecs.list.iter().any(|c| matches!(c, Codec::Delta(..))) && codecs.order.is_some() {
+            return Err(list.bad("without a transpose beside the delta"));
+        }
+        for codec in &mut codecs.list {
+            if let Codec::Delta(_, endian) = codec {
+                *endian = codecs.endian;
+            }
+        }
         Ok((codecs, shard))
     }
 
-    /// Parses compressor and order of version 2.
+    /// Parses filters, compressor and order of version 2.
     pub(super) fn version_2(meta: &Json, endian: Endian, rank: usize) -> Result<Codecs, Problem> {
-        if let Some(filters) = meta.get("filters").filter(|f| f.len() > 0) {
-            return Err(filters.bad("no filters"));
+        let mut list = Vec::new();
+        if let Some(filters) = meta.get("filters") {
+            for i in 0..filters.len() {
+                let (filter, id) = (filters.entry(i), filters.entry(i).required("id")?);
+                match Codec::of_numcodecs(id.text()?, &id, &filter)? {
+                    codec @ (Codec::Delta(..) | Codec::Shuffle(_)) => list.push(codec),
+                    _ => return Err(id.bad("delta or shuffle")),
+                }
+            }
         }
         let order = match meta.get("order") {
             None => None,
@@ -101,20 +133,10 @@ impl Codecs {
             Some(o) if o.value == "F" => Some((0..rank).rev().collect()),
             Some(o) => return Err(o.bad("C or F")),
         };
-        let list = match meta.get("compressor") {
-            None => Vec::new(),
-            Some(c) => {
-                let id = c.required("id")?;
-                vec![match id.text()? {
-                    "gzip" => Codec::Gzip,
-                    "zlib" => Codec::Zlib,
-                    "zstd" => Codec::Zstd,
-                    "blosc" => Codec::Blosc,
-                    "lz4" => Codec::Lz4,
-                    _ => return Err(id.bad("blosc, zstd, gzip, zlib or lz4")),
-                }]
-            }
-        };
+        if let Some(compressor) = meta.get("compressor") {
+            let id = compressor.required("id")?;
+            list.push(Codec::of_numcodecs(id.text()?, &id, &compressor)?);
+        }
         Ok(Codecs { endian, list, order })
     }
 
@@ -146,8 +168,10 @@ impl Codecs {
         from.take(len).read_to_end(&mut data).map_err(|e| Problem::io("file", &e))?;
         for (i, codec) in self.list.iter().enumerate().rev() {
             // Between two codecs the data may still be compressed.
-            let want = if self.list[..i].iter().all(|c| *c == Codec::Crc32c) {
-                bytes + 4 * i
+            let before = &self.list[..i];
+            let sums = before.iter().filter(|c| **c == Codec::Crc32c).count();
+            let want = if before.iter().all(|c| c.keeps_size()) {
+                bytes + 4 * sums
             } else {
                 most as usize
             };
@@ -165,6 +189,48 @@ fn damaged(what: String) -> Problem {
 }
 
 impl Codec {
+    /// Returns the codec that numcodecs calls `id`, with its settings. `name` is where it stands.
+    fn of_numcodecs(id: &str, name: &Json, config: &Json) -> Result<Codec, Problem> {
+        Ok(match id {
+            "gzip" => Codec::Gzip,
+            "zlib" => Codec::Zlib,
+            "zstd" => Codec::Zstd,
+            "blosc" => Codec::Blosc,
+            "lz4" => Codec::Lz4,
+            "bz2" => Codec::Bzip2,
+            "lzma" => match config.get("format") {
+                Some(format) if format.value != 1 => return Err(format.bad("1, that of xz")),
+                _ => Codec::Xz,
+            },
+            "shuffle" => match config.get("elementsize").and_then(|n| n.value.as_u64()) {
+                Some(size @ 1..=16) => Codec::Shuffle(size),
+                None => Codec::Shuffle(4),
+                Some(_) => return Err(config.bad("a shuffle of 1 to 16 bytes")),
+            },
+            "delta" => {
+                let kind = config.required("dtype")?;
+                let text = kind.text()?;
+                let same = config.get("astype").is_none_or(|t| t.value == kind.value);
+                let number = text.get(1..).and_then(Number::from_numpy);
+                let number = number.filter(|_| same);
+                let bad = || kind.bad("of a number type, and `astype` the same");
+                let big = text.starts_with('>');
+                let endian = if big { Endian::Big } else { Endian::Little };
+                Codec::Delta(number.ok_or_else(bad)?, endian)
+            }
+            _ => {
+                return Err(
+                    name.bad("blosc, zstd, gzip, zlib, lz4, bz2 or lzma; filters delta or shuffle")
+                );
+            }
+        })
+    }
+
+    /// Returns whether a chunk is as long before as after, but for checksums.
+    fn keeps_size(self) -> bool {
+        matches!(self, Codec::Crc32c | Codec::Delta(..) | Codec::Shuffle(_))
+    }
+
     /// Decodes data to at most `most` bytes.
     fn decode(self, mut data: Vec<u8>, most: usize) -> Result<Vec<u8>, Problem> {
         let bad = |e: &dyn std::fmt::Display| {
@@ -176,6 +242,19 @@ impl Codec {
             Codec::Zlib => read_all(ZlibDecoder::new(&data[..]), most),
             Codec::Zstd => zstd(&data, most),
             Codec::Blosc => blosc::decode(&data, most),
+            Codec::Bzip2 => read_all(MultiBzDecoder::new(&data[..]), most),
+            Codec::Xz => read_all(crate::unpack::xz(&data[..]), most),
+            Codec::Delta(number, endian) => match sum_up(&mut data, number, endian) {
+                true => Ok(data),
+                false => Err(bad(&"it ends inside a number")),
+            },
+            Codec::Shuffle(size) => {
+                let (size, count) = (size as usize, data.len() / size as usize);
+                if data.len() % size > 0 {
+                    return Err(bad(&"it ends inside a number"));
+                }
+                Ok((0..data.len()).map(|i| data[i % size * count + i / size]).collect())
+            }
             Codec::Lz4 => {
                 let (head, block) =
                     data.split_first_chunk().ok_or_else(|| bad(&"it is cut off"))?;
@@ -200,6 +279,36 @@ impl Codec {
             }
         }
     }
+}
+
+/// Turns differences into numbers, each the sum of all up to it. Returns whether the data are whole
+/// numbers.
+fn sum_up(data: &mut [u8], number: Number, endian: Endian) -> bool {
+    macro_rules! sum {
+        ($t:ty, $add:expr) => {{
+            let mut sum = <$t>::default();
+            for word in data.chunks_exact_mut(size_of::<$t>()) {
+                let bytes = (&*word).try_into().expect("a word");
+                let (add, big): (fn($t, $t) -> $t, bool) = ($add, endian == Endian::Big);
+                let x = if big { <$t>::from_be_bytes(bytes) } else { <$t>::from_le_bytes(bytes) };
+                sum = add(sum, x);
+                word.copy_from_slice(&if big { sum.to_be_bytes() } else { sum.to_le_bytes() });
+            }
+        }};
+    }
+    match number {
+        Number::U8 => sum!(u8, u8::wrapping_add),
+        Number::I8 => sum!(i8, i8::wrapping_add),
+        Number::U16 => sum!(u16, u16::wrapping_add),
+        Number::I16 => sum!(i16, i16::wrapping_add),
+        Number::U32 => sum!(u32, u32::wrapping_add),
+        Number::I32 => sum!(i32, i32::wrapping_add),
+        Number::U64 => sum!(u64, u64::wrapping_add),
+        Number::I64 => sum!(i64, i64::wrapping_add),
+        Number::F32 => sum!(f32, |a, b| a + b),
+        Number::F64 => sum!(f64, |a, b| a + b),
+    }
+    (data.len() as u64).is_multiple_of(number.bytes())
 }
 
 /// Reads a reader to its end; fails after `most` bytes.
@@ -273,7 +382,16 @@ fn permutation(order: &Json, rank: usize) -> Result<Vec<usize>, Problem> {
 }
 
 impl Shard {
-    fn from_config(config: &Json, inner: Vec<u64>) -> Result<Shard, Problem> {
+    /// Returns the shape of the chunks in which samples are.
+    pub(super) fn innermost(&self) -> &[u64] {
+        self.nested.as_ref().map_or(&self.inner, |shard| shard.innermost())
+    }
+
+    fn from_config(
+        config: &Json,
+        inner: Vec<u64>,
+        nested: Option<Box<Shard>>,
+    ) -> Result<Shard, Problem> {
         let at_end = match config.get("index_location") {
             None => true,
             Some(l) if l.value == "end" => true,
@@ -295,14 +413,15 @@ impl Shard {
                 _ => return Err(codec.bad("bytes and crc32c")),
             }
         }
-        Ok(Shard { inner, at_end, checked })
+        Ok(Shard { inner, nested, at_end, checked })
     }
 
-    /// Reads the index of a shard of `len` bytes: offset and size, in bytes, of each inner chunk.
+    /// Reads the index of a shard of `len` bytes from `at` on: offset from there and size, in bytes, of
+    /// each inner chunk.
     pub(super) fn index(
         &self,
         file: &mut File,
-        len: u64,
+        (at, len): (u64, u64),
         grid: &[u64],
     ) -> Result<Vec<(u64, u64)>, Problem> {
         let counts = grid.iter().zip(&self.inner).map(|(g, i)| g / i);
@@ -312,7 +431,7 @@ impl Shard {
             return Err(damaged(format!("has {len} bytes, less than its index takes")));
         };
         let io = |e: std::io::Error| Problem::io("index", &e);
-        let start = if self.at_end { len - bytes } else { 0 };
+        let start = at + if self.at_end { len - bytes } else { 0 };
         file.seek(SeekFrom::Start(start)).map_err(io)?;
         let mut data = Vec::new();
         file.take(bytes).read_to_end(&mut data).map_err(io)?;

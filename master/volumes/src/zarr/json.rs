@@ -66,7 +66,8 @@ impl Json {
     }
 
     pub(super) fn bad(&self, want: &str) -> Problem {
-        let text: String = self.value.to_string().chars().take(60).collect();
+        // A text without its quotes.
+        let text = self.value.as_str().map_or_else(|| self.value.to_string(), String::from);
         Problem::malformed(
             self.place.as_str(),
             format!("{} is not read here", quoted(&text)),

@@ -18,7 +18,7 @@ use crate::limit::{ByteCap, free_memory};
 use crate::pick::{Axis, Kind, Pick};
 use crate::source::Folder;
 use crate::units::{Step, steps_in_mm};
-use crate::{Hints, Opened};
+use crate::{Hints, Opened, reads};
 use array::Array;
 use json::{Json, path};
 use serde_json::Value;
@@ -41,10 +41,13 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let mut notes = Vec::new();
     let root = Arc::new(Folder::open(folder, "folder")?);
     if array::is_array(&root, "") {
+        hints.check_flags(reads::ZARR)?;
         let array = Array::open(&root, "")?;
-        let placed = Placed::without_metadata(&array, &hints.pick)?;
+        let mut placed = Placed::without_metadata(&array, &hints.pick)?;
+        placed.spacing = hints.raw.spacing.unwrap_or(placed.spacing);
         return read(array, placed, &name, notes, hints.cap());
     }
+    hints.check_flags(reads::OME_ZARR)?;
     let mut group = "";
     let mut scales = multiscales(&root, group)?;
     // bioformats2raw writes each picture into a numbered group of its own.
@@ -139,7 +142,7 @@ fn read(
     lattice
         .check()
         .map_err(|e| Problem::malformed("coordinateTransformations", e, "correct the scale"))?;
-    let file_type = array.number.name();
+    let file_type = array.kind;
     let volume = Volume::new(name, file_type, false, lattice, samples, map);
     Ok(Opened { volume, notes })
 }

@@ -166,6 +166,9 @@ fn canonical_field(name: &str) -> String {
         "datafile" => "data file",
         "lineskip" => "line skip",
         "byteskip" => "byte skip",
+        "axismins" => "axis mins",
+        "axismaxs" => "axis maxs",
+        "centerings" => "centers",
         name => name,
     }
     .to_string()
@@ -373,12 +376,14 @@ impl Axes {
             })?;
         let list = sizes.iter().map(u64::to_string).collect::<Vec<_>>().join(" x ");
         if count < 3 {
-            let what = if count == 2 { "a picture of two axes" } else { "a row of one axis" };
-            return Err(Problem::unsupported(
-                fields.with_line("dimension"),
-                format!("{list} samples are {what}, not a volume"),
-                "stack its pictures, and save a volume of three axes",
-            ));
+            return Err(match sizes[..] {
+                [width, height] => Problem::flat(fields.with_line("dimension"), width, height),
+                _ => Problem::unsupported(
+                    fields.with_line("dimension"),
+                    format!("{list} samples are a row of one axis, not a volume"),
+                    "save a volume of three axes",
+                ),
+            });
         }
         let directions = match fields.get("space directions") {
             Some(_) => vectors(fields, "space directions", None)?,
@@ -511,18 +516,14 @@ fn lattice(fields: &Fields, axes: &Axes, dims: [u32; 3]) -> Result<(Lattice, boo
     let mut lattice = if fields.get("space directions").is_some() {
         lattice_from_directions(fields, axes, dims)?
     } else {
-        let spacings = fields.per_axis("spacings", axes.count)?;
-        let mut spacing = [1.0; 3];
-        if let Some(words) = spacings {
-            for (a, &axis) in axes.kept.iter().enumerate() {
-                let x: f64 = words[axis].parse().map_err(|_| {
-                    fields.malformed("spacings", "has something else than numbers", "correct it")
-                })?;
-                // The format writes NaN for "unknown".
-                spacing[a] = if x.is_nan() { 1.0 } else { x };
-            }
+        let spacings = numbers(fields, "spacings", axes)?;
+        let ranges = Ranges::from_fields(fields, axes)?;
+        let (mut spacing, mut first) = ([1.0; 3], DVec3::ZERO);
+        for a in 0..3 {
+            spacing[a] = spacings[a].or(ranges.step(a, dims[a])).unwrap_or(1.0);
+            first[a] = ranges.first(a, spacing[a]).unwrap_or(0.0);
         }
-        let mut lattice = Lattice::from_spacing(dims, spacing);
+        let mut lattice = Lattice { origin: first, ..Lattice::from_spacing(dims, spacing) };
         if let (Some(origin), Some(_)) = (origin(fields)?, space) {
             lattice.origin = origin;
         }
@@ -541,6 +542,54 @@ fn lattice(fields: &Fields, axes: &Axes, dims: [u32; 3]) -> Result<(Lattice, boo
         Problem::malformed(fields.with_line(field), e, "correct the axes")
     })?;
     Ok((lattice, anatomical))
+}
+
+/// Returns a field's numbers along the three kept axes; `None` where the format writes NaN for
+/// "unknown".
+fn numbers(fields: &Fields, name: &str, axes: &Axes) -> Result<[Option<f64>; 3], Problem> {
+    let mut found = [None; 3];
+    let Some(words) = fields.per_axis(name, axes.count)? else { return Ok(found) };
+    for (to, &axis) in found.iter_mut().zip(&axes.kept) {
+        let x: f64 = words[axis]
+            .parse()
+            .map_err(|_| fields.malformed(name, "has something else than numbers", "correct it"))?;
+        *to = (!x.is_nan()).then_some(x);
+    }
+    Ok(found)
+}
+
+/// What an axis spans (`axis mins`, `axis maxs`), which some files have in place of a spacing.
+struct Ranges {
+    mins: [Option<f64>; 3],
+    maxs: [Option<f64>; 3],
+    /// Whether the ends are those of cells, with samples in their middles, and not samples.
+    cells: [bool; 3],
+}
+
+impl Ranges {
+    fn from_fields(fields: &Fields, axes: &Axes) -> Result<Ranges, Problem> {
+        let centers = fields.per_axis("centers", axes.count)?;
+        // teem takes cells where a file does not say.
+        let node = |axis: usize| centers.as_ref().is_some_and(|c| c[axis] == "node");
+        Ok(Ranges {
+            mins: numbers(fields, "axis mins", axes)?,
+            maxs: numbers(fields, "axis maxs", axes)?,
+            cells: axes.kept.map(|axis| !node(axis)),
+        })
+    }
+
+    /// Returns the distance of `n` samples along an axis, if it is told.
+    fn step(&self, a: usize, n: u32) -> Option<f64> {
+        let steps = f64::from(if self.cells[a] { n } else { n - 1 });
+        let step = (self.maxs[a]? - self.mins[a]?) / steps;
+        (step.is_finite() && step != 0.0).then_some(step)
+    }
+
+    /// Returns where the first sample of an axis lies, if it is told.
+    fn first(&self, a: usize, step: f64) -> Option<f64> {
+        let first = self.mins[a]? + if self.cells[a] { step / 2.0 } else { 0.0 };
+        first.is_finite().then_some(first)
+    }
 }
 
 fn lattice_from_directions(

@@ -102,8 +102,8 @@ fn nrrd_axes_of_colours_vectors_and_time_are_no_axes_of_space() {
         ("1 3 2", "kinds: scalar space space\n", "no axis of space: `scalar`, 1 sample"),
         ("3 2 1", "space directions: none (1,0,0) (0,1,0)\n", "no axis of space: `none`"),
         ("2 3 2 2", "kinds: vector space space space\n", "a voxel is 2 components (vector)"),
-        ("3 2", "", "3 x 2 samples are a picture of two axes, not a volume; stack"),
-        ("3 2", "space directions: (1,0) (0,1)\nspace dimension: 2\n", "a picture of two axes"),
+        ("3 2", "", "dimension (line 3): is a 2-D picture of 3 x 2, not a volume; give the folder"),
+        ("3 2", "space directions: (1,0) (0,1)\nspace dimension: 2\n", "is a 2-D picture of 3 x 2"),
         ("6", "", "6 samples are a row of one axis"),
     ] {
         let e = open(&head(sizes, more), &[0; 24]).unwrap_err().to_string();
@@ -366,4 +366,24 @@ fn nrrd_takes_one_of_several_volumes_and_one_number_of_a_voxel() {
         let e = read("3 2 1 2", list, nth(2)).unwrap_err();
         assert_eq!(e, "--volume: 2 is not there: the file has 2 volumes; give 0 to 1");
     }
+}
+
+#[test]
+fn nrrd_axis_mins_and_maxs_give_steps_and_place_where_nothing_else_does() {
+    let head =
+        |more: &str| format!("type: uint8\ndimension: 3\nsizes: 4 3 2\nencoding: raw\n{more}");
+    let place = |more: &str| {
+        let v = open(&head(more), &[0; 24]).unwrap_or_else(|e| panic!("{more}: {e}"));
+        (v.lattice.spacing(), v.lattice.origin.to_array())
+    };
+    let range = "axis mins: 0 -3 10\naxis maxs: 8 3 11\n";
+    assert_eq!(place(range), ([2.0, 2.0, 0.5], [1.0, -2.0, 10.25]));
+    let nodes = format!("{range}centerings: node node cell\n");
+    assert_eq!(place(&nodes), ([8.0 / 3.0, 3.0, 0.5], [0.0, -3.0, 10.25]));
+    // A spacing goes before; what is unknown is 1, and without a place.
+    let known = format!("{range}spacings: 1 nan 1\n");
+    assert_eq!(place(&known), ([1.0, 2.0, 1.0], [0.5, -2.0, 10.5]));
+    assert_eq!(place("axis mins: nan 1 2\n"), ([1.0; 3], [0.0, 1.5, 2.5]));
+    let e = open(&head("axis mins: a 1 2\n"), &[0; 24]).unwrap_err().to_string();
+    assert!(e.contains("axis mins (line 6): `a 1 2` has something else than numbers"), "{e}");
 }

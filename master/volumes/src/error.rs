@@ -43,6 +43,10 @@ pub struct OpenError {
     pub problem: Problem,
 }
 
+/// Remedy for a picture that is one slice of a volume.
+pub(crate) const FLAT_REMEDY: &str =
+    "give the folder with all slices of the volume, or one file of three axes";
+
 impl Problem {
     pub(crate) fn new(
         kind: OpenErrorKind,
@@ -67,6 +71,15 @@ impl Problem {
         remedy: impl Into<String>,
     ) -> Self {
         Problem::new(OpenErrorKind::Unsupported, field, what, remedy)
+    }
+
+    /// A file of two axes: a picture of `width` x `height` pixels.
+    pub(crate) fn flat(field: impl Into<String>, width: u64, height: u64) -> Self {
+        Problem::unsupported(
+            field,
+            format!("is a 2-D picture of {width} x {height}, not a volume"),
+            FLAT_REMEDY,
+        )
     }
 
     /// A panic in a reader's thread, which is a bug of this program.

@@ -247,11 +247,14 @@ fn layout(
 fn axes(fields: &Fields) -> Result<usize, Problem> {
     match fields.required("NDims", "3")?.parse() {
         Ok(axes @ 3..=16) => Ok(axes),
-        Ok(1..=2) => Err(fields.bad(
-            "NDims",
-            "axes make a picture, not a volume",
-            "stack its pictures, and save a volume of three axes",
-        )),
+        Ok(2) => {
+            let sizes = fields.required("DimSize", "256 256")?.split_ascii_whitespace();
+            let sizes: Vec<u64> = sizes.filter_map(|w| w.parse().ok()).collect();
+            Err(match sizes[..] {
+                [width, height] => Problem::flat("NDims", width, height),
+                _ => fields.bad("DimSize", "is not 2 whole numbers", "correct it"),
+            })
+        }
         _ => Err(fields.bad("NDims", "is not 3", "save one volume of it with three axes")),
     }
 }

@@ -234,6 +234,10 @@ impl Header {
         };
         let axes = match self.dim[0] {
             n @ 3..=7 => n as usize,
+            2 => {
+                let [width, height] = [1, 2].map(|a| self.dim[a].try_into().unwrap_or(0));
+                return Err(Problem::flat("dim[0]", width, height));
+            }
             n => {
                 return Err(Problem::malformed(
                     "dim[0]",

@@ -1,7 +1,8 @@
 //! Formats that are not read, told by their first bytes or their names, each with the program that
 //! converts it.
 
-use crate::error::{OpenErrorKind, Problem};
+use crate::error::{FLAT_REMEDY, OpenErrorKind, Problem};
+use crate::pictures;
 
 /// How a format is recognised.
 enum Mark {
@@ -25,12 +26,8 @@ const GIVE_RAW: &str = "give the file of numbers that it names, with the sizes a
 
 /// Marks, what the file is, and the remedy. The first line that fits decides.
 const UNREAD: &[(Mark, &str, &str)] = &[
-    (Begins(b"\x89PNG"), "is one PNG picture", "give the folder of the stack that it is from"),
-    (
-        Begins(b"\xff\xd8\xff"),
-        "is one JPEG picture",
-        "give the folder of the stack that it is from",
-    ),
+    (Begins(b"\x89PNG"), "is one PNG picture", FLAT_REMEDY),
+    (Begins(b"\xff\xd8\xff"), "is one JPEG picture", FLAT_REMEDY),
     (Begins(b"GIF8"), "is a GIF picture", "save its frames as PNG files in one folder"),
     (Begins(b"BM"), "is a BMP picture", "save the stack as PNG or TIFF, and give its folder"),
     (Begins(b"\x76\x2f\x31\x01"), "is an OpenEXR picture", "save the stack as TIFF of float32"),
@@ -165,6 +162,10 @@ const TEXT_BYTES: usize = 4096;
 /// first bytes, after decompression if `gzip`.
 pub(crate) fn problem(start: &[u8], gzip: bool, name: &str) -> Option<Problem> {
     let (what, remedy) = known(start, name)?;
+    if let Some((width, height)) = pictures::size(start).filter(|_| remedy == FLAT_REMEDY) {
+        let flat = Problem::flat("content", width.into(), height.into());
+        return Some(Problem { kind: OpenErrorKind::NotAVolume, ..flat });
+    }
     let what = match gzip {
         true => format!("{what}, inside gzip"),
         false => format!("{what}, which is not read"),
@@ -219,6 +220,16 @@ mod tests {
             (b"ObjectFileName: a.raw\nResolution: 4 3 2", "a.dat", "QVis volume"),
             (b"ZISRAWFILE\0", "a.czi", "bioformats2raw"),
             (b"\x89PNG\r\n", "a.png", "is one PNG picture, which is not read; give the folder"),
+            (
+                b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\x01\0\0\0\0\x40",
+                "a.png",
+                "content: is a 2-D picture of 256 x 64, not a volume; give the folder with all",
+            ),
+            (
+                b"\xff\xd8\xff\xe0\0\x04ab\xff\xc0\0\x0b\x08\0\x05\0\x07\x01",
+                "a.jpg",
+                "content: is a 2-D picture of 7 x 5, not a volume",
+            ),
         ] {
             let problem = problem(start, false, name).unwrap().to_string();
             assert!(problem.contains(say), "{problem}");

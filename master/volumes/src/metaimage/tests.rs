@@ -9,6 +9,13 @@ fn open(header: &str, data: &[u8]) -> Result<Volume, Problem> {
 }
 
 #[test]
+fn metaimage_of_two_axes_is_called_a_picture() {
+    let flat = HEAD.replace("NDims = 3", "NDims = 2").replace("3 2 1", "3 2");
+    let e = open(&format!("{flat}ElementDataFile = LOCAL\n"), &[0; 6]).unwrap_err().to_string();
+    assert!(e.contains("NDims: is a 2-D picture of 3 x 2, not a volume; give the folder"), "{e}");
+}
+
+#[test]
 fn metaimage_reads_local_data_raw_compressed_and_as_text() {
     let data = [1, 2, 3, 4, 5, 6];
     let want = Samples::U8(data.to_vec());
@@ -56,7 +63,7 @@ fn metaimage_axes_of_one_sample_after_the_third_are_dropped() {
         ("3 2 1 1", "1 2 1 0", "DimSize (line 3): `1 2 1 0` has no samples"),
         ("3 2 1 1", "3 2 1", "is not 4 whole numbers"),
         ("0 0 1 0 0", "0 0 1 5 0", "leads out of the space of its first three axes"),
-        ("NDims = 4", "NDims = 2", "NDims (line 2): `2` axes make a picture, not a volume"),
+        ("NDims = 4", "NDims = 2", "DimSize (line 3): `3 2 1 1` is not 2 whole numbers"),
     ] {
         let head = format!("{four}{place}ElementDataFile = LOCAL\n").replace(from, to);
         let e = open(&head, &[0; 6]).unwrap_err().to_string();

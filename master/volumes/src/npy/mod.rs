@@ -259,6 +259,9 @@ impl Array {
         }
         let refused = |what: String, remedy: &str| Err(Problem::unsupported("shape", what, remedy));
         let Some((dims, more)) = shape.split_first_chunk::<3>() else {
+            if let [width, height] = shape[..] {
+                return Err(Problem::flat("shape", width, height));
+            }
             return refused(
                 format!("({sizes}) is not that of a volume, which has three axes"),
                 "stack the pictures of a volume, for instance with numpy.stack",

@@ -157,7 +157,7 @@ fn numpy_errors_name_field_and_remedy() {
     for (descr, shape, say) in [
         ("<c8", "(2, 3, 4)", "descr: `<c8` is complex numbers; save plain numbers"),
         ("|O", "(2, 3, 4)", "descr: `|O` is Python objects"),
-        ("<f4", "(3, 4)", "shape: (3, 4) is not that of a volume"),
+        ("<f4", "(3, 4)", "shape: is a 2-D picture of 4 x 3, not a volume; give the folder"),
         ("<f4", "(2, 2, 3, 4)", "shape: (2, 2, 3, 4) may have 4 colours or components"),
         ("<f4", "(0, 2, 3, 5)", "has no samples"),
         ("<f4", "()", "shape: () is not that of a volume"),

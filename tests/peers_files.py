@@ -7,7 +7,8 @@
 Each file holds 7x5x3 numbers of one type. `slabcast convert` writes it as raw NRRD, whose samples must
 be the peer's to the bit, in the file's type; `slabcast info --json` gives steps and origin, which must
 be the peer's in RAS. Files of several volumes are read by `--volume`, `--time` and `--channel`. A peer
-that is not installed is named, and its files are left out. Exits with 1 if a file differs.
+that is not installed is named, and its files are left out. Files of two axes have to be refused as
+pictures. Exits with 1 if a file differs.
 """
 
 import importlib
@@ -23,7 +24,7 @@ DIMS = (7, 5, 3)
 TYPES = ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"]
 NRRD = {"uint8": "u1", "int8": "i1", "uint16": "u2", "int16": "i2", "uint32": "u4", "int32": "i4",
         "uint64": "u8", "int64": "i8", "float": "f4", "double": "f8"}
-PEERS = ["nibabel", "SimpleITK", "nrrd", "tifffile", "zarr", "pydicom", "vtk"]
+PEERS = ["numpy", "nibabel", "SimpleITK", "nrrd", "tifffile", "zarr", "pydicom", "vtk"]
 peer = {}
 counts = {}
 
@@ -75,6 +76,16 @@ def check(writer, path, want, *flags, steps=None, origin=None):
         print(f"DIFFERS: {name}: {got.dtype} {got.ravel('F')[:3]}, want {want.ravel('F')[:3]}")
 
 
+def refuse(writer, path, say):
+    """Checks that a file is refused in these words."""
+    row = counts.setdefault(writer, [0, 0, 0])
+    said = run("info", path)
+    right = said.returncode == 1 and say in said.stderr
+    row[0 if right else 1] += 1
+    if not right:
+        print(f"DIFFERS: {writer} {path}: {said.returncode} {said.stderr.strip()[:200]}")
+
+
 def nibabel():
     nib = peer["nibabel"]
     turned = np.array([[0, -2, 0, 31.5], [1.5, 0, 0, -12.25], [0, 0, 3, 107.75], [0, 0, 0, 1]])
@@ -92,6 +103,15 @@ def nibabel():
         nib.save(nib.Nifti1Image(a, turned, dtype=a.dtype), "t.nii.gz")
         for n in (0, 3):
             check("nibabel, times", "t.nii.gz", a[..., n], "--volume", str(n))
+        if kind in ("u1", "i2", "i4", "f4"):  # FreeSurfer's types
+            for name in ("a.mgh", "a.mgz"):
+                nib.save(nib.MGHImage(a, turned), name)
+                affine = nib.load(name).affine
+                for n in (0, 3):
+                    check("nibabel, FreeSurfer", name, a[..., n], "--time", str(n),
+                          steps=affine[:3, :3].T, origin=affine[:3, 3])
+        nib.save(nib.Nifti1Image(a[:, :, 0, 0], turned, dtype=a.dtype), "flat.nii")
+        refuse("nibabel, two axes", "flat.nii", "is a 2-D picture of 7 x 5, not a volume")
 
 
 def SimpleITK():
@@ -124,6 +144,12 @@ def SimpleITK():
                 check("SimpleITK, vectors", name, a[..., n], "--channel", str(n))
 
 
+        flat = itk.GetImageFromArray(np.ascontiguousarray(a[:, :, 0, 0].T))
+        for name in ("flat.nrrd", "flat.mha", "flat.nii"):
+            itk.WriteImage(flat, name)
+            refuse("SimpleITK, two axes", name, "is a 2-D picture of 7 x 5, not a volume")
+
+
 def nrrd():
     for kind in TYPES:
         a = numbers(kind)
@@ -140,6 +166,10 @@ def nrrd():
         a = numbers(kind, (4,))
         peer["nrrd"].write("l.nrrd", a, {"kinds": ["domain"] * 3 + ["list"]})
         check("pynrrd, list", "l.nrrd", a[..., 2], "--volume", "2")
+        a = numbers(kind)
+        peer["nrrd"].write("r.nrrd", a, {"axis mins": [0, 1, 2], "axis maxs": [14, 11, 3.5],
+                                         "centerings": ["cell"] * 3})
+        check("pynrrd, axis mins", "r.nrrd", a, steps=np.diag((2, 2, 0.5)), origin=(1, 2, 2.25))
 
 
 def tifffile():
@@ -166,7 +196,42 @@ def tifffile():
             check("tifffile, channels", name, a[..., 1], "--channel", "1")
 
 
+        a = numbers(kind, (3,))
+        for planar in ("contig", "separate"):
+            axes = (2, 1, 0, 3) if planar == "contig" else (2, 3, 1, 0)
+            for packed in (None, "zlib"):
+                peer["tifffile"].imwrite("rgb.tif", np.ascontiguousarray(a.transpose(axes)),
+                                         photometric="rgb", planarconfig=planar, compression=packed)
+                for n in (0, 2):
+                    check("tifffile, colours", "rgb.tif", a[..., n], "--channel", str(n))
+    a = numbers("f4").astype("f2")
+    for packed in (None, "zlib"):
+        for order in "<>":
+            pages = np.ascontiguousarray(a.transpose(2, 1, 0))
+            peer["tifffile"].imwrite("h.tif", pages, compression=packed, byteorder=order,
+                                     photometric="minisblack")
+            check("tifffile, float16", "h.tif", a.astype("f4"))
+
+
 def zarr():
+    import numcodecs as n
+    for kind in TYPES + ["f2", "b1"]:
+        a = numbers("u1") % 2 == 1 if kind == "b1" else numbers("f4" if kind == "f2" else kind)
+        a = np.asfortranarray((a / 100 if kind == "f2" else a).astype(kind))
+        want = a.astype({"f2": "f4", "b1": "u1"}.get(kind, kind))
+        codecs = [n.BZ2(), n.LZMA(), n.Zlib(), n.GZip(), n.LZ4(), n.Zstd(), n.Blosc()]
+        filters = [None, [n.Shuffle(np.dtype(kind).itemsize)]]
+        if kind not in ("f2", "b1"):
+            filters.append([n.Delta(f"<{kind}" if np.dtype(kind).itemsize > 1 else f"|{kind}")])
+        for codec in codecs:
+            for chosen in filters:
+                z = peer["zarr"].create_array("n.zarr", shape=DIMS[::-1], chunks=(2, 3, 4),
+                                              dtype=kind, zarr_format=2, overwrite=True,
+                                              filters=chosen, compressors=codec)
+                z[:] = a.transpose(2, 1, 0)
+                # Sums of differences of floats round, in zarr as in slabcast.
+                back = np.asfortranarray(z[:].transpose(2, 1, 0)).astype(want.dtype)
+                check("zarr, numcodecs", "n.zarr", back)
     for kind in TYPES:
         for version in (2, 3):
             for chunks in ((3, 5, 7), (2, 2, 4)):
@@ -183,6 +248,8 @@ def zarr():
 
 
 def pydicom():
+    import pydicom as pydicom_module
+    import pydicom.data
     from pydicom.dataset import FileDataset, FileMetaDataset
     from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
     for kind in ("u1", "u2", "i2"):
@@ -216,6 +283,23 @@ def pydicom():
                   steps=[[-0.75, 0, 0], [0, -1.25, 0], [0, 0, 2.5]], origin=[-31.5, 12.25, 0])
 
 
+    # One of eight slices is missing.
+    a = np.asfortranarray(np.random.default_rng(3).integers(0, 4000, (7, 5, 8)).astype("i2"))
+    d = pydicom_module.dcmread("dicom_i2/00.dcm")
+    os.makedirs("gap", exist_ok=True)
+    for k in (0, 1, 2, 4, 5, 6, 7):
+        d.file_meta.MediaStorageSOPInstanceUID = d.SOPInstanceUID = generate_uid()
+        d.InstanceNumber, d.ImagePositionPatient = k + 1, [31.5, -12.25, 2.5 * k]
+        d.PixelData = np.ascontiguousarray(a[:, :, k].T).tobytes()
+        d.save_as(f"gap/{k}.dcm", enforce_file_format=True)
+    want = a.astype("f4")
+    want[:, :, 3] = np.nan
+    check("pydicom, a gap", "gap", want, steps=[[-0.75, 0, 0], [0, -1.25, 0], [0, 0, 2.5]],
+          origin=[-31.5, 12.25, 0])
+    colours = pydicom_module.data.get_testdata_file("SC_rgb_jpeg.dcm")
+    refuse("pydicom, colours", colours, "a picture in colours (`RGB`)")
+
+
 def vtk():
     v = peer["vtk"]
     from vtk.util.numpy_support import numpy_to_vtk
@@ -231,16 +315,45 @@ def vtk():
         for mode in ("Ascii", "Binary", "Appended"):
             if mode == "Ascii" and np.dtype(kind).kind == "f":
                 continue  # its text has fewer digits
-            for packed in (False, True):
+            for packed in ("None", "ZLib", "LZ4", "LZMA"):
                 w = v.vtkXMLImageDataWriter()
                 w.SetFileName("a.vti")
                 w.SetInputData(image)
                 getattr(w, f"SetDataModeTo{mode}")()
-                if not packed:
-                    w.SetCompressorTypeToNone()
+                getattr(w, f"SetCompressorTypeTo{packed}")()
                 w.Write()
                 check("VTK", "a.vti", a, steps=np.diag((0.7, 1.3, 2.9)),
                       origin=(31.5, -12.25, 107.75))
+        other = np.asfortranarray(a[::-1])
+        array = numpy_to_vtk(other.ravel("F"), deep=True)
+        array.SetName("other")
+        image.GetPointData().AddArray(array)
+        w = v.vtkXMLImageDataWriter()
+        w.SetFileName("two.vti")
+        w.SetInputData(image)
+        w.Write()
+        legacy = v.vtkStructuredPointsWriter()
+        legacy.SetFileName("two.vtk")
+        legacy.SetInputData(image)
+        legacy.SetFileTypeToBinary()
+        legacy.Write()
+        for name in ("two.vti", "two.vtk"):
+            for dataset, want in (("values", a), ("other", other)):
+                check("VTK, one of two arrays", name, want, "--dataset", dataset,
+                      steps=np.diag((0.7, 1.3, 2.9)), origin=(31.5, -12.25, 107.75))
+
+
+def numpy():
+    for kind in TYPES + ["f2", "b1"]:
+        a = numbers("u1") % 2 == 1 if kind == "b1" else numbers("f4" if kind == "f2" else kind)
+        a = (a / 100 if kind == "f2" else a).astype(kind)
+        want = np.asfortranarray(a.astype({"f2": "f4", "b1": "u1"}.get(kind, kind)))
+        np.save("a.npy", np.ascontiguousarray(a.transpose(2, 1, 0)))
+        check("NumPy", "a.npy", want)
+        np.savez_compressed("a.npz", ct=np.ascontiguousarray(a.transpose(2, 1, 0)), other=a)
+        check("NumPy", "a.npz", want, "--dataset", "ct")
+        np.save("flat.npy", a[:, :, 0].T)
+        refuse("NumPy, two axes", "flat.npy", "is a 2-D picture of 7 x 5, not a volume")
 
 
 if __name__ == "__main__":

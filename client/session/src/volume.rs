@@ -40,7 +40,7 @@ pub struct InputArgs {
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     series: Option<String>,
-    /// Which array of a file of several (.npz, .vtk): its name [default: the only one, or the first]
+    /// Which array of a file of several (.npz, .vti, .vtk): its name [default: the only one, or the first]
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     dataset: Option<String>,
@@ -163,4 +163,27 @@ pub fn open(path: &Path) -> Result<Volume, Fail> {
 
 fn open_with(path: &Path, hints: &Hints) -> Result<Opened, Fail> {
     slabcast_volumes::open_with(path, hints).map_err(|e| Fail::failed(e.to_string()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+    use slabcast_volumes::{Flag, takers};
+
+    #[derive(clap::Parser)]
+    struct Program {
+        #[command(flatten)]
+        _input: InputArgs,
+    }
+
+    #[test]
+    fn help_names_the_formats_that_take_a_flag() {
+        let help = Program::command().render_long_help().to_string();
+        let help = help.split_whitespace().collect::<Vec<_>>().join(" ");
+        for flag in [Flag::Dataset, Flag::Level] {
+            assert!(help.contains(&takers(flag)), "{flag:?}: {} is not in {help}", takers(flag));
+        }
+        assert!(help.contains("--series <NAME> Which DICOM series"), "{help}");
+    }
 }

@@ -22,6 +22,7 @@ use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
 use slabcast_proto::model::{VolumeEntry, VolumeHeader, VolumeOrigin};
 use slabcast_scene::path::Orientation;
 use slabcast_scene::request::VolumeChoice;
+use slabcast_volumes::endings;
 use std::collections::BTreeMap;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
@@ -38,12 +39,6 @@ const NAMES_LISTED: usize = 8;
 
 /// Files of the folder of volumes that are listed at most.
 const MOST_FILES: usize = 10_000;
-
-/// Endings of names that make a file of the folder a volume. Data files beside a header have others.
-const ENDINGS: [&str; 19] = [
-    ".nrrd", ".nhdr", ".mha", ".mhd", ".nii", ".nii.gz", ".vti", ".vtk", ".tif", ".tiff", ".npy",
-    ".npz", ".mgh", ".mgz", ".mrc", ".map", ".ccp4", ".hdr", ".dcm",
-];
 
 /// Description of a volume, without its samples.
 #[derive(Clone, Debug)]
@@ -706,11 +701,12 @@ fn no_such_digest(digest: Digest32) -> VolumeError {
 /// Returns a file's name without the ending that says its format.
 fn stem(name: &str) -> &str {
     let lower = name.to_ascii_lowercase();
-    let ending = ENDINGS.iter().chain([&".zarr"]).filter(|e| lower.ends_with(**e));
+    let ending = endings().chain([".zarr"]).filter(|e| lower.ends_with(e));
     ending.map(|e| e.len()).max().map_or(name, |bytes| &name[..name.len() - bytes])
 }
 
-/// Returns the volumes of a folder: files with an ending of [`ENDINGS`], and folders.
+/// Returns the volumes of a folder: files with an ending of [`endings`], and
+/// folders.
 fn list_files(folder: &Path) -> std::io::Result<BTreeMap<String, Stamp>> {
     let mut files = BTreeMap::new();
     for found in std::fs::read_dir(folder)? {
@@ -722,7 +718,7 @@ fn list_files(folder: &Path) -> std::io::Result<BTreeMap<String, Stamp>> {
         // Of what a link points to.
         let Ok(about) = std::fs::metadata(found.path()) else { continue };
         let lower = name.to_ascii_lowercase();
-        let is_volume = about.is_dir() || ENDINGS.iter().any(|e| lower.ends_with(e));
+        let is_volume = about.is_dir() || endings().any(|e| lower.ends_with(e));
         if is_volume && files.len() < MOST_FILES {
             let bytes = if about.is_dir() { 0 } else { about.len() };
             files.insert(name, Stamp { bytes, modified: about.modified().ok() });

@@ -6,7 +6,7 @@ use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::source::{Folder, Inside};
 #[cfg(feature = "zarr")]
 use crate::zarr;
-use crate::{Hints, Opened, pictures, tiff_stack, unread};
+use crate::{Hints, Opened, pictures, reads, tiff_stack, unread};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -31,32 +31,29 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     {
         let slices = matching(dicom::sniff);
         if !slices.is_empty() {
+            hints.check_flags(reads::DICOM)?;
             return dicom::open(&slices, folder, hints, None).map_err(|p| point_below(folder, p));
         }
     }
     let tiffs = matching(tiff_stack::sniff);
     if !tiffs.is_empty() {
-        hints.pick.choose(&[], "folder")?;
-        return tiff_stack::read_files(tiffs, &name, &hints.raw, hints.cap());
+        hints.check_flags(reads::TIFF)?;
+        return tiff_stack::read_files(tiffs, &name, hints);
     }
     // Volume files that the user may have meant. A picture beside one may be its preview.
-    const ENDS: [&str; 18] = [
-        ".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd", ".vti", ".raw", ".raw.gz", ".hdr",
-        ".mgz", ".mgh", ".mrc", ".map", ".rec", ".npy", ".npz", ".vtk",
-    ];
     let volumes: Vec<String> = files
         .iter()
         .filter_map(|(path, _)| {
             let name = path.file_name()?.to_string_lossy().into_owned();
-            ENDS.iter().any(|end| name.to_ascii_lowercase().ends_with(end)).then(|| quoted(&name))
+            reads::is_volume_name(&name).then(|| quoted(&name))
         })
         .collect();
     let (png, jpeg) = (matching(pictures::is_png), matching(pictures::is_jpeg));
     let has_pictures = !png.is_empty() || !jpeg.is_empty();
     if has_pictures && volumes.is_empty() {
-        hints.pick.choose(&[], "folder")?;
+        hints.check_flags(reads::PICTURES)?;
         let (chosen, left_out) = if png.is_empty() { (jpeg, 0) } else { (png, jpeg.len()) };
-        let mut opened = pictures::read_files(chosen, &name, &hints.raw, hints.cap())?;
+        let mut opened = pictures::read_files(chosen, &name, hints)?;
         if left_out > 0 {
             opened
                 .notes
@@ -176,6 +173,7 @@ pub(crate) fn open_series_of(file: &Path, hints: &Hints) -> Result<Opened, Probl
         Some(folder) if !folder.as_os_str().is_empty() => folder,
         _ => Path::new("."),
     };
+    hints.check_flags(reads::DICOM)?;
     // Spelt as in the folder's list, which is compared with it.
     let file = folder.join(file.file_name().unwrap_or_default());
     let slices = dicom_files(folder)?;

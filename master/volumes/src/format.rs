@@ -1,8 +1,9 @@
 //! Formats that are told by their first bytes, plain or inside gzip, and read from front to back.
 
 use crate::error::Problem;
+use crate::reads::{self, ReadFormat};
 use crate::source::Source;
-use crate::{Hints, RawHints, mgh, mrc, nifti, npy, vtk};
+use crate::{Hints, mgh, mrc, nifti, npy, vtk};
 use slabcast_common::volume::Volume;
 use std::path::Path;
 
@@ -32,6 +33,18 @@ impl Format {
         formats.into_iter().find_map(|(format, is)| is.then_some(format))
     }
 
+    /// Returns the format's entry in the list of all.
+    fn listed(self) -> &'static ReadFormat {
+        match self {
+            Format::Numpy => reads::NUMPY,
+            Format::NumpyArchive => reads::NUMPY_ARCHIVE,
+            Format::Pair => reads::PAIR,
+            Format::FreeSurfer => reads::FREESURFER,
+            Format::Mrc => reads::MRC,
+            Format::LegacyVtk => reads::LEGACY_VTK,
+        }
+    }
+
     /// Reads a file from its start. `folder` is where the second file of a pair lies.
     pub(crate) fn read(
         self,
@@ -42,19 +55,7 @@ impl Format {
         hints: &Hints,
     ) -> Result<Volume, Problem> {
         let dataset = hints.dataset.as_deref();
-        // NumPy alone keeps no spacing.
-        let numpy = matches!(self, Format::Numpy | Format::NumpyArchive);
-        let spacing = RawHints { spacing: hints.raw.spacing, ..RawHints::default() };
-        if !(hints.raw.is_empty() || numpy && hints.raw == spacing) {
-            return Err(Problem::malformed(
-                "--type, --spacing, --skip, --byte-order",
-                "are for raw numbers, and this file has a header that says all that",
-                "leave them out",
-            ));
-        }
-        if !matches!(self, Format::NumpyArchive | Format::LegacyVtk) {
-            hints.check_no_dataset()?;
-        }
+        hints.check_flags(self.listed())?;
         match self {
             Format::Numpy => npy::read(source, gzip, name, &hints.raw),
             Format::NumpyArchive => npy::read_archive(source, name, &hints.raw, dataset),
@@ -69,6 +70,7 @@ impl Format {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::RawHints;
 
     fn open(bytes: Vec<u8>, hints: &Hints) -> Result<Volume, String> {
         let source = Source::from_bytes(bytes);
@@ -82,7 +84,7 @@ mod tests {
         let numpy = npy::tests::npy(1, "<u2", false, "(2, 3, 4)");
         for bytes in [numpy.clone(), mgh::tests::mgh(0, true), nifti] {
             let e = open(bytes, &dataset).unwrap_err();
-            assert!(e.contains("--dataset: is for files of several arrays"), "{e}");
+            assert!(e.contains("--dataset: is for .npz, .vti, .vtk, and this is"), "{e}");
         }
         let raw = RawHints { spacing: Some([1.0, 2.0, 3.0]), ..RawHints::default() };
         let spaced = Hints { raw, ..Hints::default() };

@@ -22,13 +22,17 @@
 //!
 //! - NRRD: `.nrrd`, and `.nhdr` with its data files
 //! - MetaImage: `.mha`, and `.mhd` with its data files
-//! - NIfTI-1 and NIfTI-2 in one file, and pairs of NIfTI and ANALYZE 7.5: `.nii`, `.hdr` with `.img`
-//! - FreeSurfer's `.mgh` and `.mgz`, MRC and CCP4 maps, NumPy's `.npy` and `.npz`
-//! - VTK image data in XML: `.vti`; legacy structured points: `.vtk`
-//! - TIFF: the pages of one file, or a folder of single pages; PNG and JPEG: a folder of them
-//! - raw numbers, with size and type from flags or from the file's name
-//! - DICOM series, one folder of slices (feature `dicom`)
+//! - NIfTI-1 and NIfTI-2 in one file: `.nii`, `.nii.gz`; pairs of NIfTI and ANALYZE 7.5: `.hdr` with `.img`
+//! - FreeSurfer: `.mgh`, `.mgz`
+//! - MRC and CCP4 maps: `.mrc`, `.map`, `.ccp4`, `.rec`, `.st`
+//! - NumPy: `.npy`, and one array of an `.npz`
+//! - VTK image data in XML: `.vti`; legacy VTK structured points: `.vtk`
+//! - TIFF: the pages of one file (`.tif`, `.tiff`), or a folder of single pages
+//! - PNG, JPEG: a folder of pictures
+//! - raw numbers (`.raw`), with size and type from flags or from the file's name
+//! - DICOM series, one folder of slices (`.dcm`, `.ima`; feature `dicom`)
 //! - Zarr arrays of versions 2 and 3, and OME-Zarr pyramids (feature `zarr`)
+//! - volumes by formula: `formula:NAME`
 //!
 //! [`write`](mod@write) writes NRRD and NIfTI-1. Not read: colours, time series, and volumes
 //! larger than memory.
@@ -66,6 +70,7 @@ mod pictures;
 mod plain;
 mod prefilter;
 mod raw;
+mod reads;
 mod samples;
 mod sketch;
 mod source;
@@ -85,6 +90,7 @@ pub use error::{OpenError, OpenErrorKind, Problem};
 pub use numbers::{Beside, FileNumbers};
 pub use pick::Pick;
 pub use raw::RawHints;
+pub use reads::{FORMATS, Flag, ReadFormat, endings, takers};
 pub use sketch::histogram_sketch;
 pub use store::BrickStore;
 
@@ -94,11 +100,6 @@ use slabcast_common::volume::Volume;
 use source::{Folder, Inside, Source};
 use std::io::Read;
 use std::path::{Path, PathBuf};
-
-/// The formats read, as the remedy of an error names them.
-const READS: &str = "give NRRD, MetaImage, NIfTI or ANALYZE, FreeSurfer (.mgz), MRC (.mrc, .map), NumPy \
-                     (.npy, .npz), VTK image data (.vti, .vtk), TIFF, a folder of pictures, DICOM \
-                     slices or OME-Zarr, or raw numbers with --dims and --type";
 
 /// Hints for opening a volume: what its files do not say, and limits. All are optional.
 #[derive(Clone, Debug, Default)]
@@ -110,7 +111,7 @@ pub struct Hints {
     /// Program and first arguments of the process that parses DICOM by calling `dicom::serve`.
     /// `None` parses in a thread of this process, without limits on memory and time.
     pub dicom_reader: Option<Vec<std::ffi::OsString>>,
-    /// The array to read where a file holds several (`.npz`, `.vtk`), by its name.
+    /// The array to read where a file holds several (`.npz`, `.vti`, `.vtk`), by its name.
     pub dataset: Option<String>,
     /// Level of a Zarr pyramid, 0 the finest. `None` takes the finest that fits `max_bytes`, or a
     /// quarter of the free memory.
@@ -125,18 +126,6 @@ pub struct Hints {
 }
 
 impl Hints {
-    /// Refuses a name of an array for files without any.
-    fn check_no_dataset(&self) -> Result<(), Problem> {
-        match self.dataset {
-            None => Ok(()),
-            Some(_) => Err(Problem::malformed(
-                "--dataset",
-                "is for files of several arrays (.npz, .vtk), and this is none",
-                "leave it out",
-            )),
-        }
-    }
-
     fn cap(&self) -> ByteCap {
         ByteCap { asked: self.max_bytes, beside: self.beside.clone() }
     }
@@ -189,12 +178,28 @@ pub fn open_numbers(
 fn open_beside(path: &Path, hints: &Hints) -> Result<Opened, OpenError> {
     let shown = path.to_string_lossy();
     let opened = match shown.strip_prefix(formula::PREFIX) {
-        Some(_) => formula::open(&shown).map(Opened::from),
+        Some(_) => {
+            hints.check_flags(reads::FORMULA).and_then(|()| formula::open(&shown)).map(Opened::from)
+        }
         None => open_file(path, hints),
     };
     let mut opened = opened.map_err(|problem| OpenError { file: shown.into_owned(), problem })?;
     opened.notes.extend(hints.beside.take_notes());
+    opened.notes.extend(flat_note(&opened.volume));
     Ok(opened)
+}
+
+/// Returns the note on a volume of one slice, which is a 2-D picture; `None` for any other.
+fn flat_note(volume: &Volume) -> Option<String> {
+    let dims = volume.lattice.dims;
+    let thick: Vec<u32> = dims.into_iter().filter(|n| *n > 1).collect();
+    match thick[..] {
+        [width, height] => Some(format!(
+            "it is one slice, a 2-D picture of {width} x {height}, and drawn flat; for a volume {}",
+            error::FLAT_REMEDY
+        )),
+        _ => None,
+    }
 }
 
 impl From<Volume> for Opened {
@@ -205,7 +210,6 @@ impl From<Volume> for Opened {
 
 fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
     if path.is_dir() {
-        hints.check_no_dataset()?;
         return folder::open(path, hints);
     }
     #[cfg_attr(
@@ -215,7 +219,6 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let mut source = Source { cap: hints.cap(), ..Source::open(path, "file")? };
     #[cfg(feature = "dicom")]
     if dicom::sniff(source.head()?) && hints.raw.dims.is_none() {
-        hints.check_no_dataset()?;
         return folder::open_series_of(path, hints);
     }
     let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -281,7 +284,7 @@ fn read_noted(
     hints: &Hints,
 ) -> Result<Opened, Problem> {
     if tiff_stack::sniff(source.head()?) && hints.raw.dims.is_none() {
-        hints.check_no_dataset()?;
+        hints.check_flags(reads::TIFF)?;
         source.pick = hints.pick;
         return tiff_stack::read(source, name, &hints.raw);
     }
@@ -293,11 +296,17 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
     source.pick = hints.pick;
     let head = source.head()?;
     if head.is_empty() {
-        return Err(Problem::new(OpenErrorKind::NotAVolume, "content", "is empty", READS));
+        return Err(Problem::new(
+            OpenErrorKind::NotAVolume,
+            "content",
+            "is empty",
+            reads::remedy(),
+        ));
     }
     // With --dims the file is raw numbers, whatever its content looks like.
     if hints.raw.dims.is_some() {
         let gzip = head.starts_with(GZIP);
+        hints.check_flags(reads::RAW)?;
         hints.pick.choose(&[], "content")?;
         return raw::read(source, gzip, name, &hints.raw);
     }
@@ -305,24 +314,14 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
     if let Some(format) = Format::of(&if gzip { unpacked(head) } else { head.to_vec() }, gzip) {
         return format.read(source, gzip, folder, name, hints);
     }
-    hints.check_no_dataset()?;
-    let has_header = head.starts_with(nrrd::MAGIC)
-        || nifti::sniff(head)
-        || metaimage::sniff(head)
-        || vti::sniff(head);
-    if has_header && !hints.raw.is_empty() {
-        return Err(Problem::malformed(
-            "--type, --spacing, --skip, --byte-order",
-            "are for raw numbers, and this file has a header that says all that",
-            "leave them out",
-        ));
-    }
     if head.starts_with(nrrd::MAGIC) {
+        hints.check_flags(reads::NRRD)?;
         return nrrd::read(source, folder, name);
     }
     if gzip {
         let start = unpacked(head);
         if nifti::sniff(&start) {
+            hints.check_flags(reads::NIFTI)?;
             return nifti::read(source, true, name);
         }
         if start.starts_with(nrrd::MAGIC) {
@@ -333,24 +332,28 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
             ));
         }
         if raw::is_described(name, &hints.raw) {
+            hints.check_flags(reads::RAW)?;
             return raw::read(source, true, name, &hints.raw);
         }
         return Err(unread::problem(&start, true, name).unwrap_or_else(|| {
             let what = "is gzip, but not around a volume that we know";
-            Problem::new(OpenErrorKind::NotAVolume, "content", what, READS)
+            Problem::new(OpenErrorKind::NotAVolume, "content", what, reads::remedy())
         }));
     }
     if nifti::sniff(head) {
+        hints.check_flags(reads::NIFTI)?;
         return nifti::read(source, false, name);
     }
     if metaimage::sniff(head) {
+        hints.check_flags(reads::METAIMAGE)?;
         return metaimage::read(source, folder, name);
     }
     if vti::sniff(head) {
-        hints.pick.choose(&[], "content")?;
-        return vti::read(source, name);
+        hints.check_flags(reads::VTI)?;
+        return vti::read(source, name, hints.dataset.as_deref());
     }
     if tiff_stack::sniff(head) {
+        hints.check_flags(reads::TIFF)?;
         return tiff_stack::read(source, name, &hints.raw).map(|opened| opened.volume);
     }
     let described = raw::is_described(name, &hints.raw);
@@ -358,9 +361,10 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
         return Err(problem);
     }
     if described || is_raw(name) {
+        hints.check_flags(reads::RAW)?;
         return raw::read(source, false, name, &hints.raw);
     }
-    Err(Problem::new(OpenErrorKind::NotAVolume, "content", describe(head, name), READS))
+    Err(Problem::new(OpenErrorKind::NotAVolume, "content", describe(head, name), reads::remedy()))
 }
 
 /// Returns the first bytes inside gzip, of which `head` are the first.

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Writes small volumes with the peers' own writers, and compares what slabcast reads.
 
-    python3 -m venv venv && venv/bin/pip install nibabel SimpleITK pynrrd tifffile zarr pydicom vtk
+    python3 -m venv venv && venv/bin/pip install nibabel SimpleITK pynrrd tifffile imagecodecs zarr pydicom vtk
     venv/bin/python tests/peers_files.py target/debug/slabcast
 
 Each file holds 7x5x3 numbers of one type. `slabcast convert` writes it as raw NRRD, whose samples must
@@ -204,7 +204,7 @@ def tifffile():
                                          photometric="rgb", planarconfig=planar, compression=packed)
                 for n in (0, 2):
                     check("tifffile, colours", "rgb.tif", a[..., n], "--channel", str(n))
-    a = numbers("f4").astype("f2")
+    a = (numbers("f4") / 100).astype("f2")
     for packed in (None, "zlib"):
         for order in "<>":
             pages = np.ascontiguousarray(a.transpose(2, 1, 0))

@@ -540,6 +540,11 @@ fn legacy_vtk_mutants_neither_panic_nor_hang_nor_fill_memory() {
         .into_iter()
         .flat_map(|(text, field)| ["short", "double"].map(|kind| vtk(text, kind, field)))
         .collect();
+    let bytes = |seed: &[u8]| {
+        let from = "SCALARS second short\nLOOKUP_TABLE default";
+        String::from_utf8_lossy(seed).replace(from, "COLOR_SCALARS second 1").into_bytes()
+    };
+    let seeds = [&seeds[..], &[bytes(&seeds[2])]].concat();
     survive_plain("vtk", &seeds);
 }
 

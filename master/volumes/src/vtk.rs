@@ -9,7 +9,7 @@ use crate::samples::{self, Endian, Layout, Number, Supply};
 use crate::source::{self, Source};
 use crate::unpack::Encoding;
 use glam::DVec3;
-use slabcast_common::volume::{Lattice, Volume};
+use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
 use std::io::{BufRead, Read};
 
 /// First bytes of a file.
@@ -122,6 +122,9 @@ pub(crate) fn read(
             }
             "VECTORS" | "NORMALS" | "TENSORS" | "TEXTURE_COORDINATES" | "COLOR_SCALARS" => {
                 let array = Array::other(&key, &words, text, &grid)?;
+                if array.is_wanted(dataset) {
+                    break Some(array);
+                }
                 seen.push(array.name.clone());
                 file.skip_array(text, &array, len)?;
             }
@@ -157,6 +160,16 @@ pub(crate) fn read(
             samples::read(&mut file.inner.take(layout.bytes()), supply, &layout, cap)?
         }
     };
+    if array.shares
+        && let Samples::F32(shares) = &samples
+    {
+        // As VTK reads them.
+        let mut bytes = Vec::new();
+        samples::reserve(&mut bytes, shares.len())?;
+        bytes.extend(shares.iter().map(|x| (255.0 * x + 0.5) as u8));
+        let samples = Samples::U8(bytes);
+        return Ok(Volume::new(name, "uint8", false, lattice, samples, ValueMap::IDENTITY));
+    }
     Ok(Volume::new(name, number.name(), false, lattice, samples, map))
 }
 
@@ -236,6 +249,8 @@ struct Array {
     components: u64,
     count: u64,
     cells: bool,
+    /// Whether the numbers are bytes written as shares of 255, in text.
+    shares: bool,
 }
 
 impl Array {
@@ -287,7 +302,15 @@ impl Array {
             ));
         }
         let size = number.bytes();
-        Ok(Array { name, number: drawn.then_some(number), size, components, count, cells })
+        Ok(Array {
+            name,
+            number: drawn.then_some(number),
+            size,
+            components,
+            count,
+            cells,
+            shares: false,
+        })
     }
 
     /// `SCALARS name type [components]`.
@@ -327,7 +350,11 @@ impl Array {
             return Err(bad(key, "has no name, size or type"));
         };
         let mut array = Array::new((name, kind), components, grid, None)?;
-        array.number = None;
+        // VTK calls colours what has one byte a point, too.
+        match key == "COLOR_SCALARS" && components == 1 {
+            true => array.shares = text,
+            false => array.number = None,
+        }
         Ok(array)
     }
 
@@ -529,6 +556,28 @@ pub(crate) mod tests {
                 assert_eq!(open(crate::fuzz::gzip(&bytes), None).unwrap().0.digest(), v.digest());
             }
         }
+    }
+
+    #[test]
+    fn legacy_vtk_of_one_byte_a_point_is_read_as_vtk_writes_it() {
+        let head = |coding: &str| {
+            format!(
+                "# vtk DataFile Version 5.1\nt\n{coding}\nDATASET STRUCTURED_POINTS\nDIMENSIONS 2 2 \
+                 1\nSPACING 1 1 1\nORIGIN 0 0 0\nPOINT_DATA 4\nCOLOR_SCALARS values 1\n"
+            )
+        };
+        let binary = [head("BINARY").as_bytes(), &[0, 100, 200, 255, b'\n']].concat();
+        let text = head("ASCII") + "0 0.392157 0.784314 1 \n";
+        for bytes in [binary, text.into_bytes()] {
+            let (v, _) = open(bytes, Some("values")).unwrap();
+            assert_eq!(
+                (&v.samples, v.file_type.as_str()),
+                (&Samples::U8(vec![0, 100, 200, 255]), "uint8")
+            );
+        }
+        let three = [head("BINARY").replace("values 1", "values 3").as_bytes(), &[9; 12]].concat();
+        let e = open(three, None).unwrap_err().to_string();
+        assert!(e.contains("there are none with one number a point"), "{e}");
     }
 
     #[test]

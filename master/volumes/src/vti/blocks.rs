@@ -45,7 +45,7 @@ enum Block {
     Zlib(ZlibDecoder<Take<Box<dyn Read + Send>>>),
     /// A block that was decoded whole, and the data after it.
     Lz4(Cursor<Vec<u8>>, Box<dyn Read + Send>),
-    Xz(unpack::Xz<Take<Box<dyn Read + Send>>>),
+    Xz(Box<unpack::Xz<Take<Box<dyn Read + Send>>>>),
 }
 
 impl Block {
@@ -114,7 +114,7 @@ impl Blocks {
         let mut body = inner.take(packed);
         Ok(match self.compressor {
             Compressor::Zlib => Block::Zlib(ZlibDecoder::new(body)),
-            Compressor::Xz => Block::Xz(unpack::xz(body)),
+            Compressor::Xz => Block::Xz(Box::new(unpack::xz(body))),
             Compressor::Lz4 => {
                 // A size is believed where the bytes can account for it.
                 let most = LZ4_MAX_BYTES.min(LZ4_RATIO * packed.min(LZ4_MAX_BYTES));

@@ -250,7 +250,7 @@ impl Codec {
             },
             Codec::Shuffle(size) => {
                 let (size, count) = (size as usize, data.len() / size as usize);
-                if data.len() % size > 0 {
+                if !data.len().is_multiple_of(size) {
                     return Err(bad(&"it ends inside a number"));
                 }
                 Ok((0..data.len()).map(|i| data[i % size * count + i / size]).collect())

@@ -8,6 +8,7 @@
 //! and times are pages, too. The description tells them from slices, and the first of each is read.
 
 mod as_stored;
+mod by_number;
 mod description;
 
 use crate::error::{OpenErrorKind, Problem, quoted};
@@ -21,11 +22,12 @@ use crate::units::steps_in_mm;
 use crate::unpack::{copy_on, wrapped};
 use crate::{Hints, Opened};
 use as_stored::AsStored;
+pub(crate) use by_number::compare_by_number;
 use description::{Description, Slices, Writer};
 use slabcast_common::volume::{Lattice, Volume};
 use std::collections::VecDeque;
 use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use tiff::decoder::{ChunkType, Decoder, Limits};
 use tiff::tags::Tag;
 use tiff::{ColorType, TiffError};
@@ -782,27 +784,6 @@ impl Read for Planes {
         self.left -= n as u64;
         Ok(n)
     }
-}
-
-/// Compares file names in natural order: numbers in them by value, letters without case.
-pub(crate) fn compare_by_number(a: &Path, b: &Path) -> std::cmp::Ordering {
-    let key = |p: &Path| {
-        let name = p.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
-        let mut words: Vec<(String, String)> = Vec::new();
-        let mut rest = name.as_str();
-        while !rest.is_empty() {
-            let digits = rest.starts_with(|c: char| c.is_ascii_digit());
-            let end = rest.find(|c: char| c.is_ascii_digit() != digits).unwrap_or(rest.len());
-            let word = &rest[..end];
-            rest = &rest[end..];
-            // Numbers compare by length, then by digits, without leading zeros.
-            let bare = if digits { word.trim_start_matches('0') } else { word };
-            let rank = if digits { format!("0{:04}", bare.len()) } else { "1".into() };
-            words.push((rank, bare.to_string()));
-        }
-        words
-    };
-    key(a).cmp(&key(b)).then_with(|| a.cmp(b))
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 use super::*;
 use slabcast_common::volume::Samples;
 use std::io::Cursor;
+use std::path::Path;
 use tiff::encoder::{Compression, TiffEncoder, colortype};
 
 /// Pages of 5 x 4 samples 0, 1, 2, ...

@@ -6,7 +6,7 @@
 //! normal) and 3 to 5 on the wire.
 
 use crate::ids::BrickId;
-use crate::volume::{Digest32, SampleKind, Samples};
+use crate::volume::{Digest32, SampleKind, Samples, le_bytes};
 
 /// Edge of a brick in voxels (the paper's choice, section 4.2).
 pub const BRICK_EDGE: u32 = 8;
@@ -250,13 +250,9 @@ impl Brick {
             }
             out.extend(mask);
         }
-        match &self.values {
-            Samples::U8(v) => out.extend(v),
-            Samples::U16(v) => out.extend(v.iter().flat_map(|x| x.to_le_bytes())),
-            Samples::F32(v) => out.extend(v.iter().flat_map(|x| x.to_le_bytes())),
-        }
+        out.extend_from_slice(&self.values.le_bytes(0..n));
         if let Some(normals) = &self.normals {
-            out.extend(normals.iter().flat_map(|x| x.to_le_bytes()));
+            out.extend_from_slice(&le_bytes(normals, |x| x.to_le_bytes()));
         }
         if let Some(gradients) = &self.gradients {
             out.extend(gradients);

@@ -227,8 +227,17 @@ impl Samples {
     pub fn le_bytes(&self, range: std::ops::Range<usize>) -> Cow<'_, [u8]> {
         match self {
             Samples::U8(v) => Cow::Borrowed(&v[range]),
-            Samples::U16(v) => v[range].iter().flat_map(|x| x.to_le_bytes()).collect(),
-            Samples::F32(v) => v[range].iter().flat_map(|x| x.to_le_bytes()).collect(),
+            Samples::U16(v) => le_bytes(&v[range], |x| x.to_le_bytes()),
+            Samples::F32(v) => le_bytes(&v[range], |x| x.to_le_bytes()),
+        }
+    }
+
+    /// Returns how many samples have each code, from 0 to the type's largest; `None` of floats.
+    pub fn code_counts(&self) -> Option<Vec<u64>> {
+        match self {
+            Samples::U8(v) => Some(counts_of(v, 1 << 8)),
+            Samples::U16(v) => Some(counts_of(v, 1 << 16)),
+            Samples::F32(_) => None,
         }
     }
 
@@ -276,6 +285,40 @@ impl Samples {
             _ => panic!("samples of two types can't be mixed"),
         }
     }
+}
+
+/// Returns the little-endian bytes of numbers: mostly as they lie in memory.
+pub(crate) fn le_bytes<T: bytemuck::NoUninit, const N: usize>(
+    numbers: &[T],
+    bytes: impl Fn(&T) -> [u8; N],
+) -> Cow<'_, [u8]> {
+    match cfg!(target_endian = "little") {
+        true => Cow::Borrowed(bytemuck::cast_slice(numbers)),
+        false => numbers.iter().flat_map(bytes).collect(),
+    }
+}
+
+/// Returns how many of `samples` have each of `codes` codes.
+fn counts_of<T: Copy + Into<usize>>(samples: &[T], codes: usize) -> Vec<u64> {
+    // Four tables, since in a run of air each count would wait for the one before. A piece's counts fit 32
+    // bits.
+    let mut counts = vec![0u64; codes];
+    let mut tables = vec![[0u32; 4]; codes];
+    for piece in samples.chunks(1 << 30) {
+        let (fours, rest) = piece.as_chunks::<4>();
+        for [a, b, c, d] in fours {
+            tables[(*a).into()][0] += 1;
+            tables[(*b).into()][1] += 1;
+            tables[(*c).into()][2] += 1;
+            tables[(*d).into()][3] += 1;
+        }
+        rest.iter().for_each(|&code| tables[code.into()][0] += 1);
+        for (count, table) in counts.iter_mut().zip(&mut tables) {
+            *count += table.iter().map(|&n| u64::from(n)).sum::<u64>();
+            *table = [0; 4];
+        }
+    }
+    counts
 }
 
 /// Map from stored codes to the file's values: `value = offset + scale * code`.
@@ -352,55 +395,49 @@ impl ValueSummary {
             anatomical: false,
             core: None,
         };
-        match samples {
-            Samples::U8(v) => {
-                for &c in v {
-                    s.histogram[c as usize] += 1;
-                }
-                s.min_code = s.histogram.iter().position(|&n| n > 0).unwrap_or(0) as f64;
-                s.max_code = s.histogram.iter().rposition(|&n| n > 0).unwrap_or(0) as f64;
-            }
-            Samples::U16(v) => {
-                let (lo, hi) = v.iter().fold((u16::MAX, 0), |(lo, hi), &c| (lo.min(c), hi.max(c)));
-                let lo = lo.min(hi);
-                (s.min_code, s.max_code) = (f64::from(lo), f64::from(hi));
-                // Counted by code first: a bin needs a division, and there are 65536 codes at
-                // most but millions of samples. Two tables, since in a run of air each count
-                // would wait for the one before.
-                let mut counts = vec![[0u64; 2]; usize::from(hi - lo) + 1];
-                let mut pairs = v.chunks_exact(2);
-                for pair in &mut pairs {
-                    counts[usize::from(pair[0] - lo)][0] += 1;
-                    counts[usize::from(pair[1] - lo)][1] += 1;
-                }
-                pairs.remainder().iter().for_each(|&c| counts[usize::from(c - lo)][0] += 1);
-                for (code, [a, b]) in (lo..=hi).zip(counts) {
-                    let bin = s.bin(f64::from(code));
-                    s.histogram[bin] += a + b;
-                }
-            }
-            Samples::F32(v) => {
-                let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
-                for &c in v {
-                    if c.is_finite() {
-                        lo = lo.min(c);
-                        hi = hi.max(c);
-                    } else if c.is_nan() {
-                        s.nan += 1;
-                    } else {
-                        s.infinite += 1;
-                    }
-                }
-                if lo <= hi {
-                    (s.min_code, s.max_code) = (lo as f64, hi as f64);
-                }
-                for &c in v.iter().filter(|c| c.is_finite()) {
-                    let bin = s.bin(c as f64);
-                    s.histogram[bin] += 1;
-                }
+        // Counted by code first: a bin needs a division, and there are 65536 codes at most but millions of
+        // samples.
+        let counts = samples.code_counts();
+        if let Some(counts) = &counts {
+            s.min_code = counts.iter().position(|&n| n > 0).unwrap_or(0) as f64;
+            s.max_code = counts.iter().rposition(|&n| n > 0).unwrap_or(0) as f64;
+            for (code, &n) in counts.iter().enumerate().filter(|(_, n)| **n > 0) {
+                let bin = s.bin(code as f64);
+                s.histogram[bin] += n;
             }
         }
-        s.core = core::find(samples, &s);
+        if let Samples::F32(v) = samples {
+            let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
+            for &c in v {
+                if c.is_finite() {
+                    lo = lo.min(c);
+                    hi = hi.max(c);
+                } else if c.is_nan() {
+                    s.nan += 1;
+                } else {
+                    s.infinite += 1;
+                }
+            }
+            if lo <= hi {
+                (s.min_code, s.max_code) = (lo as f64, hi as f64);
+            }
+            for &c in v.iter().filter(|c| c.is_finite()) {
+                let bin = s.bin(c as f64);
+                s.histogram[bin] += 1;
+            }
+        }
+        s.core = match (&counts, samples) {
+            (_, Samples::U8(_)) => None,
+            (Some(counts), _) => {
+                let some = || (0u32..).map(f64::from).zip(counts.iter().copied());
+                core::find(|| some().filter(|(_, n)| *n > 0), &s)
+            }
+            (None, Samples::F32(v)) => {
+                let finite = || v.iter().filter(|c| c.is_finite());
+                core::find(|| finite().map(|&c| (f64::from(c), 1)), &s)
+            }
+            (None, _) => None,
+        };
         s
     }
 

@@ -5,7 +5,7 @@ use glam::DVec3;
 use slabcast_common::brick::{BRICK_VOXELS, BrickGrid};
 use slabcast_common::quality::Compositing;
 use slabcast_common::transfer::Classifier;
-use slabcast_common::volume::{Lattice, Samples, ValueSummary, Volume, VolumeInfo};
+use slabcast_common::volume::{Digest32, Lattice, ValueSummary, Volume, VolumeInfo};
 use slabcast_scene::path::Orientation;
 use slabcast_scene::presets::{self, Levels};
 use slabcast_session::fail::{Fail, say};
@@ -62,7 +62,8 @@ pub(crate) fn run(args: &InfoArgs) -> Result<(), Fail> {
     args.axes.orientation()?;
     let volume = args.input.open(&args.volume)?;
     let orientation = args.axes.for_volume(&volume)?;
-    let info = volume.info(volume.digest());
+    // JSON alone has the digest; what `--orient` draws is nobody's but its own.
+    let info = volume.info(if args.json { volume.digest() } else { Digest32::default() });
     if let Some(path) = &args.orient {
         if volume.anatomical {
             return Err(Fail::usage(
@@ -89,11 +90,7 @@ pub(crate) fn run(args: &InfoArgs) -> Result<(), Fail> {
 /// Samples that are visible under each preset.
 fn shares(volume: &Volume, info: &VolumeInfo) -> Result<Vec<Share>, Fail> {
     // Samples of few codes are counted once, for all presets.
-    let counts: Option<Vec<u64>> = match &volume.samples {
-        Samples::U8(v) => Some(count(v, 256)),
-        Samples::U16(v) => Some(count(v, 65536)),
-        Samples::F32(_) => None,
-    };
+    let counts = volume.samples.code_counts();
     presets::NAMES
         .iter()
         .map(|&(name, what)| {
@@ -114,14 +111,6 @@ fn shares(volume: &Volume, info: &VolumeInfo) -> Result<Vec<Share>, Fail> {
             Ok(Share { name, what, voxels, bytes: voxels * each })
         })
         .collect()
-}
-
-fn count<T: Copy + Into<usize>>(samples: &[T], codes: usize) -> Vec<u64> {
-    let mut counts = vec![0; codes];
-    for &c in samples {
-        counts[c.into()] += 1;
-    }
-    counts
 }
 
 /// The box of the volume's cells (N samples count as N spacings), in world units.

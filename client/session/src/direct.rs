@@ -13,6 +13,7 @@ use slabcast_render::Simd;
 use slabcast_render::region::{self, BrickSupply};
 use slabcast_render::tile::{self, ProjectedBrick, Scratch};
 use slabcast_render::visibility::{Directory, VisibleBricks};
+use slabcast_render::work::{self, WorkCounters};
 use slabcast_volumes::BrickStore;
 use std::collections::BTreeMap;
 use std::ops::Deref;
@@ -79,7 +80,16 @@ pub fn draw(frame: &Frame, bricks: &Bricks, cut: Cut) -> Picture {
 
 /// Draws a whole frame and returns the renderer's counters with it.
 pub fn draw_counted(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
-    if cut.slabs > 1 { in_slabs(frame, bricks, cut) } else { through(frame, bricks, cut) }
+    if cut.slabs > 1 {
+        return in_slabs(frame, bricks, cut);
+    }
+    let draw = |visible: &VisibleBricks, tile, Memory { scratch, pixels }: &mut Memory| {
+        region::draw(frame, visible, bricks, Simd::detect(), tile, scratch, pixels)
+    };
+    let (picture, counted) = through(frame, bricks, cut, draw);
+    let mut counters = Counters::default();
+    counted.into_iter().for_each(|counted| counters += counted);
+    (picture, counters)
 }
 
 /// Returns the tiles of a picture with edges of `edge` pixels, row by row.
@@ -91,8 +101,33 @@ pub fn tile_rects(whole: Rect, edge: u32) -> impl Iterator<Item = Rect> {
     corners.map(move |(x, y)| Rect::new(x, y, x + edge, y + edge).intersect(&whole))
 }
 
-/// Each tile through all sheets, as a cluster's workers draw it.
-fn through(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
+/// Draws a whole frame and returns the work of each pixel with it, that of sections only if they are
+/// asked for.
+pub fn draw_with_work(
+    frame: &Frame,
+    bricks: &Bricks,
+    cut: Cut,
+    sections: bool,
+) -> (Picture, WorkCounters) {
+    let draw = |visible: &VisibleBricks, tile, Memory { scratch, pixels }: &mut Memory| {
+        let simd = Simd::detect();
+        let counted = work::draw(frame, visible, bricks, simd, tile, sections, scratch, pixels);
+        (tile, counted)
+    };
+    let (picture, tiles) = through(frame, bricks, cut, draw);
+    let mut all = WorkCounters::new(frame.view.size.map(|n| n as usize));
+    tiles.iter().for_each(|(tile, counted)| all.put(*tile, counted));
+    (picture, all)
+}
+
+/// Draws each tile through all sheets by `draw`, as a cluster's workers do, into the thread's memory.
+/// Returns the results in the order in which tiles were drawn.
+fn through<T: Send>(
+    frame: &Frame,
+    bricks: &Bricks,
+    cut: Cut,
+    draw: impl Fn(&VisibleBricks, Rect, &mut Memory) -> T + Sync,
+) -> (Picture, Vec<T>) {
     let whole = Rect::from_size(frame.view.size);
     let edge = cut.tile as i32;
     let outlook = VisibleBricks::new(&frame.view, &bricks.directory);
@@ -100,25 +135,21 @@ fn through(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
     let weighed = tile_rects(whole, cut.tile).map(|tile| (outlook.weight(&tile), tile));
     let mut tiles: Vec<(u64, Rect)> = weighed.filter(|(weight, _)| *weight > 0).collect();
     tiles.sort_by_key(|&(weight, tile)| (std::cmp::Reverse(weight), tile.y0, tile.x0));
-    let simd = Simd::detect();
     let mut picture = Picture { size: frame.view.size, pixels: vec![[0.0; 4]; whole.area()] };
     // A row of tiles is a band of the picture; who has drawn a tile writes it there.
     let rows = picture.pixels.chunks_mut((whole.x1 * edge) as usize);
     let bands: Vec<_> = rows.map(Mutex::new).collect();
     let drawn = map_parallel(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
         let (_, tile) = tiles[i];
-        let Memory { scratch, pixels } = memory;
-        let counted = region::draw(frame, &outlook, bricks, simd, tile, scratch, pixels);
+        let counted = draw(&outlook, tile, memory);
         let band = tile.y0 / edge;
         let in_band = Rect { y0: tile.y0 - band * edge, y1: tile.y1 - band * edge, ..tile };
         let mut rows = bands[band as usize].lock().unwrap_or_else(PoisonError::into_inner);
-        pixels.write(in_band, frame.view.size, &mut rows);
+        memory.pixels.write(in_band, frame.view.size, &mut rows);
         counted
     });
     drop(bands);
-    let mut counters = Counters::default();
-    drawn.into_iter().for_each(|counted| counters += counted);
-    (picture, counters)
+    (picture, drawn)
 }
 
 /// Slab after slab, as under the paper's schedule.

@@ -6,7 +6,7 @@
 //! in bins of its own, until little more can be cut. Volumes without such ends, nearly all, have no
 //! core: their range will do.
 
-use super::{Samples, ValueCore, ValueSummary};
+use super::{ValueCore, ValueSummary};
 
 /// Share of the samples that may lie beyond either end: 170 of a scan of 256^3. Fillings of teeth
 /// are ten times as many.
@@ -27,10 +27,11 @@ const ROUNDS: usize = 40;
 const ROOM: f64 = 0.1;
 
 /// Finds the core of samples whose range and histogram are `s`; `None` if there is no need of one.
-pub(super) fn find(samples: &Samples, s: &ValueSummary) -> Option<ValueCore> {
-    if matches!(samples, Samples::U8(_)) {
-        return None;
-    }
+/// `codes` gives the finite codes, each with how many samples have it.
+pub(super) fn find<I: Iterator<Item = (f64, u64)>>(
+    codes: impl Fn() -> I,
+    s: &ValueSummary,
+) -> Option<ValueCore> {
     let padded = s.map.scale > 0.0;
     let (mut lo, mut hi) = (s.min_code, s.max_code);
     let (mut cut_below, mut histogram) = (false, s.histogram.clone());
@@ -46,14 +47,14 @@ pub(super) fn find(samples: &Samples, s: &ValueSummary) -> Option<ValueCore> {
         }
         cut_below |= first > 0;
         (lo, hi) = (a, b);
-        histogram = counted(samples, lo, hi);
+        histogram = counted(codes(), lo, hi);
     }
     if hi - lo > NARROW * (s.max_code - s.min_code) {
         return None;
     }
     if cut_below {
         lo = (lo - ROOM * (hi - lo)).max(s.min_code);
-        histogram = counted(samples, lo, hi);
+        histogram = counted(codes(), lo, hi);
     }
     (hi > lo).then_some(ValueCore { min_code: lo, max_code: hi, histogram })
 }
@@ -79,25 +80,18 @@ fn trimmed(histogram: &[u64], negative: bool) -> (usize, usize) {
     (first, last)
 }
 
-fn counted(samples: &Samples, lo: f64, hi: f64) -> Vec<u64> {
+fn counted(codes: impl Iterator<Item = (f64, u64)>, lo: f64, hi: f64) -> Vec<u64> {
     let mut histogram = vec![0; 256];
     let scale = 256.0 / (hi - lo);
-    let mut count = |code: f64| {
-        histogram[(((code - lo) * scale).max(0.0) as usize).min(255)] += 1;
-    };
-    match samples {
-        Samples::U8(v) => v.iter().for_each(|&c| count(f64::from(c))),
-        Samples::U16(v) => v.iter().for_each(|&c| count(f64::from(c))),
-        Samples::F32(v) => {
-            v.iter().filter(|c| c.is_finite()).for_each(|&c| count(f64::from(c)));
-        }
+    for (code, n) in codes {
+        histogram[(((code - lo) * scale).max(0.0) as usize).min(255)] += n;
     }
     histogram
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::ValueMap;
+    use super::super::{Samples, ValueMap};
     use super::*;
 
     fn core(values: Vec<f32>) -> Option<ValueCore> {

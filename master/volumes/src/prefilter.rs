@@ -12,100 +12,137 @@ use slabcast_common::volume::{Samples, Volume};
 /// Pole of the filter.
 const POLE: f32 = -0.267_949_2;
 
+/// Gain of the filter, which keeps a constant as it is.
+const GAIN: f32 = 6.0;
+
 /// Samples from which the forward pass begins: the pole to this power is 1e-7.
 const BEGIN: usize = 12;
 
 /// Returns the coefficients of all samples, in codes, in the order of the samples. They are cut off at
 /// all codes' length beyond the smallest and the largest code. Samples that are NaN count as the
 /// smallest code for their neighbours and stay NaN.
+///
+/// A layer is filtered along x and y while the cache holds it, and so are the samples of a row in all
+/// layers along z: memory is read and written twice in all.
 pub(crate) fn coefficients(volume: &Volume) -> Vec<f32> {
     let summary = &volume.summary;
     let (lo, hi) = (summary.min_code as f32, summary.max_code as f32);
-    let code = |x: f32| if x.is_nan() { lo } else { x.clamp(lo, hi) };
-    let mut c: Vec<f32> = match &volume.samples {
-        Samples::U8(v) => v.par_iter().map(|&x| f32::from(x)).collect(),
-        Samples::U16(v) => v.par_iter().map(|&x| f32::from(x)).collect(),
-        Samples::F32(v) => v.par_iter().map(|&x| code(x)).collect(),
+    let [nx, ny, _] = volume.lattice.dims.map(|n| n as usize);
+    let mut all = vec![0.0f32; volume.samples.len()];
+    let layers = all.par_chunks_mut(nx * ny);
+    let in_layer = |layer: &mut [f32]| {
+        filter_along(layer, nx);
+        filter_across(&mut layer.chunks_mut(nx).collect::<Vec<_>>());
     };
-    let [nx, ny, nz] = volume.lattice.dims.map(|n| n as usize);
-    c.par_chunks_mut(nx).for_each(|row| filter(row, nx, 1));
-    c.par_chunks_mut(nx * ny).for_each(|layer| filter(layer, ny, nx));
-    filter_layers(&mut c, nz, nx * ny);
+    match &volume.samples {
+        Samples::U8(v) => layers.zip(v.par_chunks(nx * ny)).for_each(|(layer, codes)| {
+            layer.iter_mut().zip(codes).for_each(|(to, &code)| *to = f32::from(code));
+            in_layer(layer);
+        }),
+        Samples::U16(v) => layers.zip(v.par_chunks(nx * ny)).for_each(|(layer, codes)| {
+            layer.iter_mut().zip(codes).for_each(|(to, &code)| *to = f32::from(code));
+            in_layer(layer);
+        }),
+        Samples::F32(v) => layers.zip(v.par_chunks(nx * ny)).for_each(|(layer, codes)| {
+            let code = |x: f32| if x.is_nan() { lo } else { x.clamp(lo, hi) };
+            layer.iter_mut().zip(codes).for_each(|(to, &x)| *to = code(x));
+            in_layer(layer);
+        }),
+    }
+    let mut by_row: Vec<Vec<&mut [f32]>> = (0..ny).map(|_| Vec::new()).collect();
+    all.chunks_mut(nx).enumerate().for_each(|(i, row)| by_row[i % ny].push(row));
     let span = hi - lo;
-    let cut = |c: &mut f32| *c = c.clamp(lo - span, hi + span);
-    c.par_iter_mut().for_each(cut);
+    by_row.into_par_iter().for_each(|mut rows| {
+        filter_across(&mut rows);
+        for c in rows.iter_mut().flat_map(|row| row.iter_mut()) {
+            *c = c.clamp(lo - span, hi + span);
+        }
+    });
     if let Samples::F32(v) = &volume.samples {
         let keep = |(c, x): (&mut f32, &f32)| *c = if x.is_nan() { f32::NAN } else { *c };
-        c.par_iter_mut().zip(v).for_each(keep);
+        all.par_iter_mut().zip(v).for_each(keep);
     }
-    c
+    all
 }
 
-/// Filters `n` rows of `width` samples along the direction across them.
-fn filter(rows: &mut [f32], n: usize, width: usize) {
+/// Rows that are filtered at once: additions of one row wait for each other.
+const ROWS: usize = 8;
+
+/// Filters each row of `n` samples.
+fn filter_along(rows: &mut [f32], n: usize) {
     if n < 2 {
         return;
     }
-    // The gain comes first, so that the rows need no other pass.
-    rows.iter_mut().for_each(|x| *x *= 6.0);
-    for x in 0..width {
-        let begin = mirrored(n, |i| rows[i * width + x]);
-        rows[x] = begin;
+    let mut some = rows.chunks_exact_mut(ROWS * n);
+    some.by_ref().for_each(|rows| filter_rows::<ROWS>(rows, n));
+    some.into_remainder().chunks_exact_mut(n).for_each(|row| filter_rows::<1>(row, n));
+}
+
+/// Filters `R` rows of `n` samples.
+fn filter_rows<const R: usize>(rows: &mut [f32], n: usize) {
+    let mut rest = rows;
+    let rows: [&mut [f32]; R] =
+        std::array::from_fn(|_| rest.split_off_mut(..n).expect("as many rows"));
+    let mut last: [f32; R] = std::array::from_fn(|r| {
+        let row = &rows[r];
+        mirrored(n).fold(0.0, |sum, (power, i)| sum + power * (GAIN * row[i]))
+    });
+    for r in 0..R {
+        rows[r][0] = last[r];
     }
     for i in 1..n {
-        let (before, here) = rows.split_at_mut(i * width);
-        for (x, here) in here[..width].iter_mut().enumerate() {
-            *here += POLE * before[(i - 1) * width + x];
+        for r in 0..R {
+            last[r] = GAIN * rows[r][i] + POLE * last[r];
+            rows[r][i] = last[r];
         }
     }
-    for x in 0..width {
-        let [last, before] = [rows[(n - 1) * width + x], rows[(n - 2) * width + x]];
-        rows[(n - 1) * width + x] = end(last, before);
+    for r in 0..R {
+        last[r] = end(last[r], rows[r][n - 2]);
+        rows[r][n - 1] = last[r];
     }
     for i in (0..n - 1).rev() {
-        let (here, after) = rows.split_at_mut((i + 1) * width);
-        for (x, after) in after[..width].iter().enumerate() {
-            let here = &mut here[i * width + x];
-            *here = POLE * (after - *here);
+        for r in 0..R {
+            last[r] = POLE * (last[r] - rows[r][i]);
+            rows[r][i] = last[r];
         }
     }
 }
 
-/// Filters `n` layers of `width` samples along the direction across them. Samples of a layer are
-/// filtered in parallel.
-fn filter_layers(all: &mut [f32], n: usize, width: usize) {
+/// Filters rows of equal length along the direction across them.
+fn filter_across(rows: &mut [&mut [f32]]) {
+    let n = rows.len();
     if n < 2 {
         return;
     }
-    all.par_iter_mut().for_each(|x| *x *= 6.0);
-    let first: Vec<f32> =
-        (0..width).into_par_iter().map(|x| mirrored(n, |i| all[i * width + x])).collect();
-    all[..width].copy_from_slice(&first);
-    for i in 1..n {
-        let (before, here) = all.split_at_mut(i * width);
-        let before = &before[(i - 1) * width..];
-        here[..width].par_iter_mut().zip(before).for_each(|(here, before)| *here += POLE * before);
+    let mut begin = vec![0.0; rows[0].len()];
+    for (power, i) in mirrored(n) {
+        begin.iter_mut().zip(&*rows[i]).for_each(|(sum, x)| *sum += power * (GAIN * x));
     }
-    let (rest, last) = all.split_at_mut((n - 1) * width);
-    let before = &rest[(n - 2) * width..];
-    last.par_iter_mut().zip(before).for_each(|(last, before)| *last = end(*last, *before));
+    rows[0].copy_from_slice(&begin);
+    for i in 1..n {
+        let (before, here) = rows.split_at_mut(i);
+        let both = here[0].iter_mut().zip(&*before[i - 1]);
+        both.for_each(|(here, before)| *here = GAIN * *here + POLE * before);
+    }
+    let (before, last) = rows.split_at_mut(n - 1);
+    let both = last[0].iter_mut().zip(&*before[n - 2]);
+    both.for_each(|(last, before)| *last = end(*last, *before));
     for i in (0..n - 1).rev() {
-        let (here, after) = all.split_at_mut((i + 1) * width);
-        let step = |(here, after): (&mut f32, &f32)| *here = POLE * (after - *here);
-        here[i * width..].par_iter_mut().zip(&after[..width]).for_each(step);
+        let (here, after) = rows.split_at_mut(i + 1);
+        let both = here[i].iter_mut().zip(&*after[0]);
+        both.for_each(|(here, after)| *here = POLE * (after - *here));
     }
 }
 
-/// The first value of the forward pass: the sum of the mirrored samples times powers of the pole.
-fn mirrored(n: usize, at: impl Fn(usize) -> f32) -> f32 {
+/// What the first value of the forward pass is the sum of: powers of the pole, each with the index of
+/// its sample in the mirrored row.
+fn mirrored(n: usize) -> impl Iterator<Item = (f32, usize)> {
     let period = 2 * (n - 1);
-    let (mut sum, mut power) = (0.0, 1.0);
-    for i in 0..BEGIN {
+    let powers = std::iter::successors(Some(1.0), |power| Some(power * POLE));
+    powers.zip(0..BEGIN).map(move |(power, i)| {
         let i = i % period;
-        sum += power * at(if i < n { i } else { period - i });
-        power *= POLE;
-    }
-    sum
+        (power, if i < n { i } else { period - i })
+    })
 }
 
 /// The last value of the backward pass, from the last two of the forward pass.
@@ -116,6 +153,60 @@ fn end(last: f32, before: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// [`coefficients`] plainly: sample by sample along one axis after the other.
+    fn plain(volume: &Volume) -> Vec<f32> {
+        let summary = &volume.summary;
+        let (lo, hi) = (summary.min_code as f32, summary.max_code as f32);
+        let codes: Vec<f32> =
+            (0..volume.samples.len()).map(|i| volume.samples.code(i) as f32).collect();
+        let code = |x: &f32| if x.is_nan() { lo } else { x.clamp(lo, hi) };
+        let mut c: Vec<f32> = codes.iter().map(code).collect();
+        let dims = volume.lattice.dims.map(|n| n as usize);
+        let strides = [1, dims[0], dims[0] * dims[1]];
+        for (n, stride) in dims.into_iter().zip(strides).filter(|(n, _)| *n > 1) {
+            for first in (0..c.len()).filter(|i| i / stride % n == 0) {
+                let at = |i: usize| first + i * stride;
+                (0..n).for_each(|i| c[at(i)] *= 6.0);
+                let (mut sum, mut power) = (0.0, 1.0);
+                for i in 0..BEGIN {
+                    let i = i % (2 * (n - 1));
+                    sum += power * c[at(if i < n { i } else { 2 * (n - 1) - i })];
+                    power *= POLE;
+                }
+                c[at(0)] = sum;
+                (1..n).for_each(|i| c[at(i)] += POLE * c[at(i - 1)]);
+                c[at(n - 1)] = end(c[at(n - 1)], c[at(n - 2)]);
+                (0..n - 1).rev().for_each(|i| c[at(i)] = POLE * (c[at(i + 1)] - c[at(i)]));
+            }
+        }
+        let cut = |(c, code): (&f32, &f32)| {
+            if code.is_nan() { f32::NAN } else { c.clamp(lo - (hi - lo), hi + (hi - lo)) }
+        };
+        c.iter().zip(&codes).map(cut).collect()
+    }
+
+    #[test]
+    fn coefficients_equal_the_plain_ones_bit_for_bit() {
+        let bits = |c: &[f32]| c.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+        for dims in [[9, 17, 8], [1, 5, 2], [2, 1, 1], [1, 1, 1], [33, 1, 20], [64, 19, 3]] {
+            let noise = |i: u32, j: u32, k: u32| ((i * 7919 + j * 104_729 + k * 1301) % 251) as u8;
+            let bytes = Volume::from_fn_u8("noise", dims, noise);
+            let Samples::U8(codes) = &bytes.samples else { unreachable!("made above") };
+            let shorts = codes.iter().map(|&c| u16::from(c) * 257).collect();
+            let wild = |(i, &c): (usize, &u8)| match i % 37 {
+                5 => f32::NAN,
+                9 => f32::INFINITY,
+                _ => f32::from(c) - 80.0,
+            };
+            let floats = codes.iter().enumerate().map(wild).collect();
+            for samples in [bytes.samples.clone(), Samples::U16(shorts), Samples::F32(floats)] {
+                let map = slabcast_common::volume::ValueMap::IDENTITY;
+                let volume = Volume::new("noise", "any", false, bytes.lattice, samples, map);
+                assert_eq!(bits(&coefficients(&volume)), bits(&plain(&volume)), "{dims:?}");
+            }
+        }
+    }
 
     /// The B-spline of coefficients at the sample `at`.
     fn spline(c: &[f32], dims: [u32; 3], at: [u32; 3]) -> f64 {

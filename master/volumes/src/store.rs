@@ -183,8 +183,11 @@ fn cut<T: Copy + Into<f64> + Sync>(
         // A voxel shows within one step of it: those beside the box count.
         let beside = needs.crop.map(|crop| crop.grown(&volume.lattice, 1.0));
         let inside = |voxel| beside.is_none_or(|c| c.contains(&volume.lattice, voxel));
-        let visible = |voxel, offset: usize| relevant(codes[offset]) && inside(voxel);
-        VoxelMask::new(field.dims, visible).dilated(needs.halo)
+        let mut mask = VoxelMask::new(field.dims, codes, &relevant);
+        if beside.is_some() {
+            mask.keep(inside);
+        }
+        mask.dilated(needs.halo)
     });
     let grid = BrickGrid::new(field.dims);
     let gradient_matrix = volume.gradient_matrix();
@@ -197,7 +200,7 @@ fn cut<T: Copy + Into<f64> + Sync>(
             found.clear();
             let corner = [x, y, z].map(|n| n * BRICK_EDGE);
             match &near {
-                Some(near) => field.collect(corner, &|_| true, &|v| near.get(v), &mut found),
+                Some(near) => near.collect(corner, &mut found),
                 None => {
                     let inside = |v| needs.crop.is_none_or(|c| c.contains(&volume.lattice, v));
                     field.collect(corner, &relevant, &inside, &mut found);
@@ -247,19 +250,37 @@ struct VoxelMask {
 }
 
 impl VoxelMask {
-    /// Marks the voxels, given by index and offset in the volume's samples, for which `marked` holds.
-    fn new(dims: [u32; 3], marked: impl Fn([u32; 3], usize) -> bool + Sync) -> Self {
+    /// Marks the voxels whose codes are relevant.
+    fn new<T: Copy + Sync>(
+        dims: [u32; 3],
+        codes: &[T],
+        relevant: &(impl Fn(T) -> bool + Sync),
+    ) -> Self {
         let [nx, ny, nz] = dims.map(|n| n as usize);
         let words = nx.div_ceil(64);
         let mut bits = vec![0u64; words * ny * nz];
-        bits.par_chunks_mut(words).enumerate().for_each(|(row, bits)| {
-            let (y, z) = ((row % ny) as u32, (row / ny) as u32);
-            for x in 0..nx {
-                let bit = u64::from(marked([x as u32, y, z], row * nx + x));
-                bits[x / 64] |= bit << (x % 64);
+        let rows = bits.par_chunks_mut(words).zip(codes.par_chunks(nx));
+        rows.for_each(|(bits, codes)| {
+            for (word, codes) in bits.iter_mut().zip(codes.chunks(64)) {
+                let bits = codes.iter().zip(0..).map(|(&code, x)| u64::from(relevant(code)) << x);
+                *word = bits.fold(0, |word, bit| word | bit);
             }
         });
         VoxelMask { dims, words, bits }
+    }
+
+    /// Keeps the marks of voxels for which `inside` holds.
+    fn keep(&mut self, inside: impl Fn([u32; 3]) -> bool + Sync) {
+        let ny = self.dims[1] as usize;
+        self.bits.par_chunks_mut(self.words).enumerate().for_each(|(row, bits)| {
+            let (y, z) = ((row % ny) as u32, (row / ny) as u32);
+            for (word, first) in bits.iter_mut().zip((0..).step_by(64)) {
+                let marked = *word;
+                for x in (0..64).filter(|x| marked >> x & 1 == 1) {
+                    *word &= !(u64::from(!inside([first + x, y, z])) << x);
+                }
+            }
+        });
     }
 
     /// Returns the mask of voxels within `steps` index steps of a marked one along each axis.
@@ -296,9 +317,33 @@ impl VoxelMask {
         self
     }
 
-    fn get(&self, [x, y, z]: [u32; 3]) -> bool {
-        let row = z as usize * self.dims[1] as usize + y as usize;
-        self.bits[row * self.words + x as usize / 64] >> (x % 64) & 1 == 1
+    /// Adds the marked voxels of the brick at `corner` to `found`.
+    fn collect(&self, corner: [u32; 3], found: &mut RelevantVoxels) {
+        let [nx, ny, _] = self.dims.map(|n| n as usize);
+        let end: [u32; 3] = std::array::from_fn(|a| (corner[a] + BRICK_EDGE).min(self.dims[a]));
+        // Marks spread beyond the end of a row.
+        let valid = (1u64 << (end[0] - corner[0])) - 1;
+        let [word, shift] = [corner[0] as usize / 64, corner[0] as usize % 64];
+        for z in corner[2]..end[2] {
+            for y in corner[1]..end[1] {
+                let row = z as usize * ny + y as usize;
+                let mut bits = self.bits[row * self.words + word] >> shift & valid;
+                if bits == 0 {
+                    continue;
+                }
+                let first = bits.trailing_zeros();
+                let last = 63 - bits.leading_zeros();
+                let local = (y - corner[1]) * 8 + (z - corner[2]) * 64;
+                while bits != 0 {
+                    let x = bits.trailing_zeros();
+                    found.index[found.voxels] = (local + x) as u16;
+                    found.offset[found.voxels] = row * nx + (corner[0] + x) as usize;
+                    found.voxels += 1;
+                    bits &= bits - 1;
+                }
+                found.reach([corner[0] + first, y, z], [corner[0] + last, y, z]);
+            }
+        }
     }
 }
 
@@ -329,6 +374,14 @@ impl Default for RelevantVoxels {
 impl RelevantVoxels {
     fn clear(&mut self) {
         (self.voxels, self.lo, self.hi) = (0, [u32::MAX; 3], [0; 3]);
+    }
+
+    /// Grows the box by the run of voxels from `first` to `last`.
+    fn reach(&mut self, first: [u32; 3], last: [u32; 3]) {
+        for a in 0..3 {
+            self.lo[a] = self.lo[a].min(first[a]);
+            self.hi[a] = self.hi[a].max(last[a]);
+        }
     }
 
     fn tight(&self) -> TightBox {
@@ -369,11 +422,7 @@ impl<T: Copy + Into<f64>> Codes<'_, T> {
                 }
                 if found.voxels > before {
                     let x = |i: usize| corner[0] + u32::from(found.index[i] & 7);
-                    let (first, last) = ([x(before), y, z], [x(found.voxels - 1), y, z]);
-                    for a in 0..3 {
-                        found.lo[a] = found.lo[a].min(first[a]);
-                        found.hi[a] = found.hi[a].max(last[a]);
-                    }
+                    found.reach([x(before), y, z], [x(found.voxels - 1), y, z]);
                 }
             }
         }

@@ -44,14 +44,14 @@
 //! that shares none of their arithmetic. [`judge::analytic`] has pictures in closed form, with
 //! derived bounds of what rounding may do to them, and [`judge::error_probe`] estimates a frame's
 //! error while it is drawn. [`mod@oracle::explain`] shows one pixel sheet by sheet, and
-//! [`oracle::work_counters`] counts the work of each pixel.
+//! [`work`] counts the work of each pixel, as [`oracle::work_counters`] does plainly.
 //!
 //! Both renderers share what a pixel *is*: the kernel's profile, sections and footprints
 //! (`primitives`) and the arithmetic of compositing a sheet (`kernels::composite`).
 //!
 //! **Rooms**, from the lowest up; each imports lower ones alone (`tests/render/rooms.rs`):
 //! `primitives`, `visibility`, `kernels` (the only one with `unsafe`), `scene`, `part`, `geometry`,
-//! `tile`, `region`; beside them `oracle` and `judge`. **This crate knows no threads, network or
+//! `tile`, `region`, `work`; beside them `oracle` and `judge`. **This crate knows no threads, network or
 //! clock**; its callers have those.
 
 pub mod judge;
@@ -61,6 +61,7 @@ pub mod scene;
 pub mod selftest;
 pub mod tile;
 pub mod visibility;
+pub mod work;
 
 // The rooms below are public for this crate's tests alone.
 #[doc(hidden)]

@@ -419,7 +419,18 @@ impl Frame {
                 shader.shade(look.rgb, normal, to_eye)
             }
         };
-        let sigma = (f64::from(look.sigma) * self.view.cell) as f32 * self.raw_scale;
+        let sigma = self.raw_extinction(look.sigma);
         [sigma, sigma * rgb[0], sigma * rgb[1], sigma * rgb[2]]
+    }
+
+    #[inline(always)]
+    fn raw_extinction(&self, sigma: f32) -> f32 {
+        (f64::from(sigma) * self.view.cell) as f32 * self.raw_scale
+    }
+
+    /// Returns the extinction of [`Frame::payload`], without the colours.
+    #[inline]
+    pub(crate) fn extinction(&self, brick: &Brick, i: usize) -> f32 {
+        self.raw_extinction(self.scene.classifier.classify_voxel(brick, i).sigma)
     }
 }

@@ -33,6 +33,7 @@ pub use crate::part::ProjectedBrick;
 use crate::part::brick_feed::FeedMemory;
 use crate::part::{BrickSource, Io, Part, Pixels};
 use crate::primitives::sizes::PART;
+use crate::primitives::work_counters::WorkCounters;
 use crate::scene::{Frame, Scene};
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{RawSums, TilePixels, TileState};
@@ -60,6 +61,14 @@ pub struct Scratch {
     pub(crate) feed: FeedMemory,
     /// Spare plane for the sums of a last sheet.
     last: Vec<RawSums>,
+}
+
+impl Scratch {
+    /// Has the sheets of each pixel of the tiles drawn from now on counted in `work`, which has a tile's
+    /// size, or no longer. Returns what was counted before.
+    pub(crate) fn count_work(&mut self, work: Option<WorkCounters>) -> Option<WorkCounters> {
+        std::mem::replace(&mut self.pixels.work, work)
+    }
 }
 
 /// Memory for voxels that wait for their sheets.

@@ -1,14 +1,13 @@
 //! `slabcast render --show`: pictures of how a picture came about.
 //!
-//! Depth, work and sheets are the serial renderer's notes about each pixel
-//! ([`slabcast_render::oracle::work_counters`]), the error is an estimate from sheets of half the
-//! thickness, and tiles with their owners are in a frame's statistics. Each is drawn over the same
-//! view as the frame would be, with a legend below that says what the colours mean.
+//! Depth, work and sheets are counts of each pixel ([`slabcast_render::work`]), the error is an estimate
+//! from sheets of half the thickness, and tiles with their owners are in a frame's statistics. Each is
+//! drawn over the same view as the frame would be, with a legend below that says what the colours mean.
 
 use slabcast_common::image::{Picture, PixelFormat};
 use slabcast_common::quality::{Compositing, Quality};
 use slabcast_common::stats::FrameStats;
-use slabcast_render::oracle::work_counters::{WorkCounters, bands, count_band, join_bands};
+use slabcast_render::work::WorkCounters;
 use slabcast_session::canvas::{Canvas, LINE, WHITE, viridis, width};
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
@@ -84,11 +83,9 @@ pub(crate) fn draw(
         let finer = direct::draw(&stage.frame_with(i, half)?, &stage.bricks, Cut::on(threads));
         error(&picture, &estimate(&picture, &finer, quality.compositing))
     } else {
-        let rows = bands(&tables, threads);
-        let parts = direct::map_parallel(rows.len(), threads, |n, _: &mut ()| {
-            (rows[n], count_band(&tables, &stage.bricks, rows[n]))
-        });
-        let (picture, notes) = join_bands(parts);
+        let sections = show == DebugView::Work;
+        let (picture, notes) =
+            direct::draw_with_work(&tables, &stage.bricks, Cut::on(threads), sections);
         match show {
             DebugView::Depth => depth(&picture, &notes, quality.thickness),
             DebugView::Sheets => {

@@ -165,7 +165,7 @@ impl Array {
             number,
             kind: name,
             endian: codecs.endian,
-            fill: fill_bytes(meta.get("fill_value"), number)?,
+            fill: stored_fill(fill_bytes(meta.get("fill_value"), number)?, name),
             key: ChunkKey { prefix, separator },
             codecs,
             shard,
@@ -196,7 +196,7 @@ impl Array {
             number,
             kind: name,
             endian,
-            fill: fill_bytes(meta.get("fill_value"), number)?,
+            fill: stored_fill(fill_bytes(meta.get("fill_value"), number)?, name),
             key: ChunkKey {
                 prefix: "",
                 separator: separator(meta.get("dimension_separator"), '.')?,
@@ -277,23 +277,19 @@ impl Array {
         let shifted = |offset| ValueMap { scale: 1.0, offset };
         macro_rules! le {
             ($t:ty) => {
-                |b: &[u8]| <$t>::from_le_bytes(b.try_into().expect("a word"))
+                <$t>::from_le_bytes
             };
         }
         Ok(match self.number {
-            Number::U8 => (Samples::U8(self.collect(placed, |b| b[0])?), ValueMap::IDENTITY),
-            Number::I8 => (Samples::U8(self.collect(placed, |b| b[0] ^ 0x80)?), shifted(-128.0)),
+            Number::U8 => (Samples::U8(self.collect(placed, le!(u8))?), ValueMap::IDENTITY),
+            Number::I8 => (Samples::U8(self.collect(placed, |[b]| b ^ 0x80)?), shifted(-128.0)),
             Number::U16 => (Samples::U16(self.collect(placed, le!(u16))?), ValueMap::IDENTITY),
             Number::I16 => {
-                let code = |b: &[u8]| le!(u16)(b) ^ 0x8000;
+                let code = |b| u16::from_le_bytes(b) ^ 0x8000;
                 (Samples::U16(self.collect(placed, code)?), shifted(-32768.0))
             }
-            // The fill value is a float of 32 bits already.
             Number::F32 if self.kind == HALF => {
-                let code = |b: &[u8]| match b {
-                    [low, high] => f32_of_half(u16::from_le_bytes([*low, *high])),
-                    b => le!(f32)(b),
-                };
+                let code = |b| f32_of_half(u16::from_le_bytes(b));
                 wide::without_fillers(self.collect(placed, code)?, beside)?
             }
             Number::F32 => wide::without_fillers(self.collect(placed, le!(f32))?, beside)?,
@@ -307,19 +303,19 @@ impl Array {
     }
 
     /// Returns all samples in one list.
-    fn collect<T: Copy + Send + Sync>(
+    fn collect<T: Copy + Default + Send + Sync, const N: usize>(
         &self,
         placed: &Placed,
-        code: impl Fn(&[u8]) -> T + Sync,
+        code: impl Fn([u8; N]) -> T + Sync,
     ) -> Result<Vec<T>, Problem> {
         self.layers(placed, 0..self.layer_count(placed), &code)
     }
 
     /// Returns all samples in pieces of whole layers, which [`wide`] frees one by one.
-    fn collect_pieces<T: Copy + Send + Sync>(
+    fn collect_pieces<T: Copy + Default + Send + Sync, const N: usize>(
         &self,
         placed: &Placed,
-        code: impl Fn(&[u8]) -> T + Sync,
+        code: impl Fn([u8; N]) -> T + Sync,
     ) -> Result<Vec<Vec<T>>, Problem> {
         let [nx, ny, _] = placed.dims.map(|n| n as usize);
         let count = self.layer_count(placed);
@@ -330,19 +326,18 @@ impl Array {
     }
 
     /// Decodes some layers of chunks, each layer as a task of its own.
-    fn layers<T: Copy + Send + Sync>(
+    fn layers<T: Copy + Default + Send + Sync, const N: usize>(
         &self,
         placed: &Placed,
         layers: Range<usize>,
-        code: &(impl Fn(&[u8]) -> T + Sync),
+        code: &(impl Fn([u8; N]) -> T + Sync),
     ) -> Result<Vec<T>, Problem> {
-        let size = self.number.bytes() as usize;
         let [nx, ny, nz] = placed.dims.map(|n| n as usize);
         let depth = self.depth(placed);
         let samples = nx * ny * (nz.min(layers.end * depth) - layers.start * depth);
-        let mut out = Vec::new();
-        reserve(&mut out, samples)?;
-        out.resize(samples, code(&self.fill[..size]));
+        // Zeros that the system gives, so that pages are first touched by the threads that fill them.
+        reserve(&mut Vec::<T>::new(), samples)?;
+        let mut out = vec![T::default(); samples];
         let layer = |(z, out): (usize, &mut [T])| self.layer(placed, layers.start + z, out, code);
         // A chunk in memory, compressed and decoded.
         let chunk = 2 * self.inner().iter().product::<u64>() * self.stored_size();
@@ -371,12 +366,12 @@ impl Array {
     }
 
     /// Decodes the chunks of layer `z` into `out`.
-    fn layer<T: Copy>(
+    fn layer<T: Copy, const N: usize>(
         &self,
         placed: &Placed,
         z: usize,
         out: &mut [T],
-        code: &impl Fn(&[u8]) -> T,
+        code: &impl Fn([u8; N]) -> T,
     ) -> Result<(), Problem> {
         let mut cell = self.first_cell(placed);
         let depth = self.depth(placed) as u64;
@@ -404,20 +399,24 @@ impl Array {
 
     /// Decodes the chunk at grid position `cell`, or the inner chunks of its shard that lie in
     /// `layer`.
-    fn read_file<T: Copy>(
+    fn read_file<T: Copy, const N: usize>(
         &self,
         placed: &Placed,
         cell: &[u64],
         layer: &Range<u64>,
         out: &mut [T],
-        code: &impl Fn(&[u8]) -> T,
+        code: &impl Fn([u8; N]) -> T,
     ) -> Result<(), Problem> {
         let path = json::path(&self.folder, &self.key.path(cell));
+        let first: Vec<u64> = cell.iter().zip(&self.grid).map(|(c, g)| c * g).collect();
         let io = |e: std::io::Error| Problem::io("file", &e);
         let (mut file, len) = match self.root.find(Path::new(&path)).map_err(io)? {
             Inside::File(file, len) => (file, len),
             // A chunk that was never written consists of the fill value.
-            Inside::Missing => return Ok(()),
+            Inside::Missing => {
+                self.fill(placed, (&first, &self.grid), layer, out, code);
+                return Ok(());
+            }
             Inside::Out => return Err(not_inside("its file", "file")),
             Inside::Other => {
                 return Err(Problem::new(
@@ -428,16 +427,21 @@ impl Array {
                 ));
             }
         };
-        let first: Vec<u64> = cell.iter().zip(&self.grid).map(|(c, g)| c * g).collect();
         let Some(shard) = &self.shard else {
-            let decoded = self.codecs.decode(&mut file, len, self.chunk_bytes())?;
-            self.copy(placed, &first, decoded, out, code);
+            self.copy(placed, &first, &self.decode::<N>(&mut file, len)?, out, code);
             return Ok(());
         };
         let place = ShardPlace { at: 0, len, first, grid: &self.grid };
-        self.read_shard(placed, (shard, place), &mut file, layer, &mut |first, decoded| {
-            self.copy(placed, first, decoded, out, code);
-        })
+        self.read_shard(placed, (shard, place), &mut file, layer, out, code)
+    }
+
+    /// Decodes a chunk of `len` bytes to numbers in little-endian order.
+    fn decode<const N: usize>(&self, from: &mut dyn Read, len: u64) -> Result<Vec<u8>, Problem> {
+        let mut decoded = self.codecs.decode(from, len, self.chunk_bytes())?;
+        if self.endian == Endian::Big {
+            decoded.chunks_exact_mut(N).for_each(<[u8]>::reverse);
+        }
+        Ok(decoded)
     }
 
     /// Returns the bytes of a decoded chunk.
@@ -445,25 +449,21 @@ impl Array {
         (self.inner().iter().product::<u64>() * self.stored_size()) as usize
     }
 
-    /// Decodes the chunks of a shard that lie in `layer`, and gives each to `take` with the index of its
-    /// first sample. A shard's chunks may be shards.
-    fn read_shard(
+    /// Decodes the chunks of a shard that lie in `layer` into `out`. A shard's chunks may be shards.
+    fn read_shard<T: Copy, const N: usize>(
         &self,
         placed: &Placed,
         (shard, place): (&Shard, ShardPlace<'_>),
         file: &mut std::fs::File,
         layer: &Range<u64>,
-        take: &mut dyn FnMut(&[u64], Vec<u8>),
+        out: &mut [T],
+        code: &impl Fn([u8; N]) -> T,
     ) -> Result<(), Problem> {
         let io = |e: std::io::Error| Problem::io("file", &e);
         let ShardPlace { at, len, first, grid } = place;
         let index = shard.index(file, (at, len), grid)?;
         let counts: Vec<u64> = grid.iter().zip(&shard.inner).map(|(g, i)| g / i).collect();
         for (n, (offset, size)) in index.into_iter().enumerate() {
-            // The mark of an inner chunk that was never written.
-            if (offset, size) == (u64::MAX, u64::MAX) {
-                continue;
-            }
             let mut corner = first.clone();
             let mut rest = n as u64;
             for a in (0..counts.len()).rev() {
@@ -481,6 +481,11 @@ impl Array {
             if !wanted {
                 continue;
             }
+            // The mark of an inner chunk that was never written.
+            if (offset, size) == (u64::MAX, u64::MAX) {
+                self.fill(placed, (&corner, &shard.inner), layer, out, code);
+                continue;
+            }
             if offset.checked_add(size).is_none_or(|end| end > len) {
                 return Err(Problem::new(
                     OpenErrorKind::Damaged,
@@ -492,30 +497,52 @@ impl Array {
             if let Some(nested) = &shard.nested {
                 let grid = &shard.inner;
                 let place = ShardPlace { at: at + offset, len: size, first: corner, grid };
-                self.read_shard(placed, (nested, place), file, layer, take)?;
+                self.read_shard(placed, (nested, place), file, layer, out, code)?;
                 continue;
             }
             file.seek(SeekFrom::Start(at + offset)).map_err(io)?;
-            let mut body = (&*file).take(size);
-            take(&corner, self.codecs.decode(&mut body, size, self.chunk_bytes())?);
+            let decoded = self.decode::<N>(&mut (&*file).take(size), size)?;
+            self.copy(placed, &corner, &decoded, out, code);
         }
         Ok(())
     }
 
+    /// Puts the fill value in place of a chunk of `shape`, whose first sample has index `first` in the
+    /// array, where it lies in `layer`.
+    fn fill<T: Copy, const N: usize>(
+        &self,
+        placed: &Placed,
+        (first, shape): (&[u64], &[u64]),
+        layer: &Range<u64>,
+        out: &mut [T],
+        code: &impl Fn([u8; N]) -> T,
+    ) {
+        let along = |axis: usize| match placed.axes[axis] {
+            None => 0..1,
+            Some(a) => first[a]..first[a].saturating_add(shape[a]).min(self.shape[a]),
+        };
+        let [xs, ys, zs] = [0, 1, 2].map(along);
+        let [width, height, _] = placed.dims.map(|n| n as usize);
+        let value = code(*self.fill.first_chunk().expect("a sample has at most eight bytes"));
+        for z in zs.start.max(layer.start)..zs.end.min(layer.end) {
+            for y in ys.clone() {
+                let row = ((z - layer.start) as usize * height + y as usize) * width;
+                out[row + xs.start as usize..row + xs.end.max(xs.start) as usize].fill(value);
+            }
+        }
+    }
+
     /// Copies a decoded chunk, whose first sample has index `first` in the array, into its layer
     /// `out`.
-    fn copy<T: Copy>(
+    fn copy<T: Copy, const N: usize>(
         &self,
         placed: &Placed,
         first: &[u64],
-        mut decoded: Vec<u8>,
+        decoded: &[u8],
         out: &mut [T],
-        code: &impl Fn(&[u8]) -> T,
+        code: &impl Fn([u8; N]) -> T,
     ) {
-        let size = self.stored_size() as usize;
-        if self.endian == Endian::Big {
-            decoded.chunks_exact_mut(size).for_each(<[u8]>::reverse);
-        }
+        let (decoded, _) = decoded.as_chunks::<N>();
         let strides = self.codecs.strides(self.inner());
         // For each of x, y, z: the chunk's first index, its samples inside the array, and their
         // stride in the chunk.
@@ -539,10 +566,14 @@ impl Array {
             for y in 0..ny {
                 let start = (((z0 + z) % depth) * height + y0 + y) * width + x0;
                 let row = &mut out[start..start + nx];
-                let mut offset = (base + z * sz + y * sy) * size;
-                for sample in row {
-                    *sample = code(&decoded[offset..offset + size]);
-                    offset += sx * size;
+                let from = base + z * sz + y * sy;
+                // Mostly samples of a row lie beside each other.
+                if sx == 1 {
+                    let from = &decoded[from..from + nx];
+                    row.iter_mut().zip(from).for_each(|(sample, from)| *sample = code(*from));
+                } else {
+                    let from = decoded[from..].iter().step_by(sx.max(1));
+                    row.iter_mut().zip(from).for_each(|(sample, from)| *sample = code(*from));
                 }
             }
         }
@@ -588,6 +619,25 @@ fn number(name: &str) -> Option<(Number, &'static str)> {
         name => Number::named(name).map(|n| (n, n.name())),
     }
 }
+
+/// Returns a fill value as the array stores it: of float16 in two bytes.
+fn stored_fill(bytes: [u8; 8], kind: &str) -> [u8; 8] {
+    if kind != HALF {
+        return bytes;
+    }
+    let value = f32::from_le_bytes(*bytes.first_chunk().expect("eight bytes"));
+    let is_it = |half: &u16| {
+        let held = f32_of_half(*half);
+        held == value || (held.is_nan() && value.is_nan())
+    };
+    let half = (0..=u16::MAX).find(is_it).unwrap_or(HALF_NAN);
+    let mut stored = [0; 8];
+    stored[..2].copy_from_slice(&half.to_le_bytes());
+    stored
+}
+
+/// A float16 that is NaN.
+const HALF_NAN: u16 = 0x7e00;
 
 /// Returns the fill value as little-endian bytes of a sample.
 fn fill_bytes(value: Option<Json>, number: Number) -> Result<[u8; 8], Problem> {

@@ -99,10 +99,31 @@ fn unpack(kind: u8, from: &[u8], to: &mut [u8]) -> Result<(), Problem> {
 /// over are not shuffled.
 fn unshuffle(plain: &[u8], size: usize, out: &mut Vec<u8>) {
     let n = plain.len() / size;
-    for i in 0..n {
-        out.extend((0..size).map(|byte| plain[byte * n + i]));
+    let start = out.len();
+    out.resize(start + n * size, 0);
+    let to = &mut out[start..];
+    match size {
+        2 => unshuffle_of::<2>(plain, to),
+        4 => unshuffle_of::<4>(plain, to),
+        8 => unshuffle_of::<8>(plain, to),
+        _ => {
+            for (byte, from) in plain.chunks_exact(n.max(1)).take(size).enumerate() {
+                let to = to[byte..].iter_mut().step_by(size);
+                to.zip(from).for_each(|(to, from)| *to = *from);
+            }
+        }
     }
     out.extend(&plain[n * size..]);
+}
+
+/// [`unshuffle`] of numbers of `SIZE` bytes, written so that it is compiled to whole registers.
+fn unshuffle_of<const SIZE: usize>(plain: &[u8], to: &mut [u8]) {
+    let (to, _) = to.as_chunks_mut::<SIZE>();
+    let n = to.len();
+    let from: [&[u8]; SIZE] = std::array::from_fn(|byte| &plain[byte * n..][..n]);
+    for (i, to) in to.iter_mut().enumerate() {
+        *to = std::array::from_fn(|byte| from[byte][i]);
+    }
 }
 
 /// Undoes the bit shuffle of a block. c-blosc 1 leaves a block as it is whose numbers are no

@@ -389,7 +389,11 @@ impl<S: Recorded> Closes<S> {
                 }
             }
             let mut shut = simd.run(Close { part, k, row: &mut row, places });
-            put(simd, &row, &places.at()[..places.len()], &mut pixels.all);
+            let at = &places.at()[..places.len()];
+            put(simd, &row, at, &mut pixels.all);
+            if let Some(work) = &mut pixels.work {
+                part.count_sheet(work, k, (&row, at), [u32::MAX, shut]);
+            }
             any_shut |= shut != 0;
             while shut != 0 {
                 let [x, y] = column_and_row(places.at()[shut.trailing_zeros() as usize % LANES]);

@@ -8,7 +8,7 @@ use crate::kernels::Simd;
 use crate::kernels::composite::field::{FieldRule, FieldScene};
 use crate::kernels::composite::{LANES, Row};
 use crate::kernels::field::{FieldSum, planes_of, weighted};
-use crate::oracle::work_counters::WorkCounters;
+use crate::primitives::work_counters::WorkCounters;
 use crate::scene::Frame;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{FrameState, Picture, TilePixels};
@@ -19,18 +19,16 @@ use std::sync::Arc;
 /// A voxel: first plane, depth in phases, brick and index in it.
 type Voxel = (i32, i32, usize, usize);
 
-/// Renders rows of a frame whose sheets hold planes of a field, in sums of `S`; the others stay
-/// empty.
+/// Renders a frame whose sheets hold planes of a field, in sums of `S`.
 pub(super) fn render<S: FieldSum>(
     frame: &Frame,
     bricks: &[Arc<Brick>],
     mut counters: Option<&mut WorkCounters>,
-    rows: (i32, i32),
 ) -> Picture {
     let (Some(rule), Some(scene)) = (&frame.field, &frame.scene.field) else {
         unreachable!("a frame whose sheets hold planes")
     };
-    let w = frame.view.size[0] as usize;
+    let [w, h] = frame.view.size.map(|n| n as usize);
     let whole = Rect::from_size(frame.view.size);
     let mut voxels: Vec<Voxel> = Vec::new();
     let mut range = SheetRange::default();
@@ -55,14 +53,14 @@ pub(super) fn render<S: FieldSum>(
     let mut here = before.clone();
     let (mut bx, mut by) = (Vec::new(), Vec::new());
     for k in range.first..range.end {
-        here[rows.0 as usize * w..rows.1 as usize * w].fill([S::default(); 4]);
+        here.fill([S::default(); 4]);
         for &v in &buckets[(k - range.first) as usize] {
             let (first, z, b, i) = voxels[v as usize];
             let brick = &bricks[b];
             let Some(footprint) = frame.footprints.at(k) else { continue };
             let placed = frame.place(&frame.corner(brick.id), brick.index[i]);
             let at = frame.screen(&placed, k, &footprint);
-            let (y0, wy) = S::window(&footprint, 1, at[1], rows, &mut by);
+            let (y0, wy) = S::window(&footprint, 1, at[1], (0, h as i32), &mut by);
             if wy.is_empty() {
                 continue;
             }
@@ -73,22 +71,17 @@ pub(super) fn render<S: FieldSum>(
                 let row = weighted::<S>(section, wy);
                 let along = frame.along_row(at, y);
                 let (x0, wx) = S::window(&footprint, 0, along, (0, w as i32), &mut bx);
-                // Nobody reads sums of shut pixels; whoever counts does so for people who wait.
-                let run = Rect::new(x0, y, x0 + wx.len() as i32, y + 1);
-                if counters.as_ref().is_some_and(|counters| counters.all_shut(run)) {
-                    continue;
-                }
                 for (x, &wx) in (x0..).zip(wx) {
                     let term = weighted::<S>(row, wx);
                     let pixel = &mut here[y as usize * w + x as usize];
                     *pixel = std::array::from_fn(|c| pixel[c].with(term[c]));
                 }
                 if let Some(counters) = counters.as_mut() {
-                    counters.add_section(run);
+                    counters.add_section(Rect::new(x0, y, x0 + wx.len() as i32, y + 1));
                 }
             }
         }
-        for y in rows.0 as usize..rows.1 as usize {
+        for y in 0..h {
             for x in 0..w {
                 let i = y * w + x;
                 if here[i][0].value() == 0.0 || frame.rule.is_shut(out.a[i]) {

@@ -7,8 +7,8 @@
 //! of how it gets there, and stands as the oracle for its bytes.
 
 use crate::kernels::composite::Sum;
-use crate::oracle::work_counters::WorkCounters;
 use crate::primitives::footprint::Footprint;
+use crate::primitives::work_counters::WorkCounters;
 use crate::scene::Frame;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{FrameState, Picture, TilePixels};
@@ -20,21 +20,19 @@ use std::sync::Arc;
 /// Renders `frame` from `bricks`, all bricks of its scene in any order. Returns linear
 /// premultiplied RGBA. Every other renderer of the crate gives these bytes.
 pub fn render(frame: &Frame, bricks: &[Arc<Brick>]) -> Picture {
-    render_counting(frame, bricks, None, (0, frame.view.size[1] as i32))
+    render_counting(frame, bricks, None)
 }
 
-/// Renders as [`render`] does and counts each pixel's work in `counters`. Of fields only `rows` are
-/// drawn.
+/// Renders as [`render`] does and counts each pixel's work in `counters`.
 pub(crate) fn render_counting(
     frame: &Frame,
     bricks: &[Arc<Brick>],
     counters: Option<&mut WorkCounters>,
-    rows: (i32, i32),
 ) -> Picture {
     if frame.is_field() {
         return match frame.scene.quality.sums {
-            Sums::I16 => super::field::render::<i16>(frame, bricks, counters, rows),
-            _ => super::field::render::<i32>(frame, bricks, counters, rows),
+            Sums::I16 => super::field::render::<i16>(frame, bricks, counters),
+            _ => super::field::render::<i32>(frame, bricks, counters),
         };
     }
     match frame.scene.quality.sums {

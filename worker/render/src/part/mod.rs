@@ -3,8 +3,11 @@
 
 pub mod brick_feed;
 
+use crate::kernels::composite::Row;
 use crate::kernels::pixel_records::STRIDE;
+use crate::kernels::touched::column_and_row;
 use crate::primitives::sizes::PART;
+use crate::primitives::work_counters::WorkCounters;
 use crate::scene::{Corner, Frame};
 use crate::visibility::open_mask::OpenMask;
 use brick_feed::ArrivingBricks;
@@ -75,12 +78,14 @@ pub struct Pixels {
     pub(crate) secants: Vec<f32>,
     /// Bits of each pixel's opacity (f32), then its three colours in fixed point.
     pub(crate) all: Vec<[u32; 4]>,
+    /// Counts of the tile's pixels, where somebody asks for them.
+    pub(crate) work: Option<WorkCounters>,
 }
 
 impl Default for Pixels {
     fn default() -> Self {
         let n = STRIDE * PART as usize;
-        Pixels { secants: vec![1.0; n], all: vec![[0; 4]; n] }
+        Pixels { secants: vec![1.0; n], all: vec![[0; 4]; n], work: None }
     }
 }
 
@@ -180,6 +185,26 @@ impl Part<'_> {
             let row = self.tile_row(y);
             for x in 0..self.rect.width() {
                 f(x, y, row + x);
+            }
+        }
+    }
+
+    /// Counts sheet `k` at the pixels of a row that was closed, given by their places in the part, as
+    /// one that was read where it held something. A bit each: those that were open, and those that are
+    /// shut now.
+    #[cold]
+    pub(crate) fn count_sheet(
+        &self,
+        work: &mut WorkCounters,
+        k: i32,
+        (row, places): (&Row, &[u32]),
+        [open, shut]: [u32; 2],
+    ) {
+        for (lane, &place) in places.iter().enumerate() {
+            // Sections have extinctions, which are no less than zero.
+            if open >> lane & 1 == 1 && row.here[0][lane] != 0.0 {
+                let [x, y] = column_and_row(place);
+                work.add_sheet(self.tile_row(y) + x, k, shut >> lane & 1 == 1);
             }
         }
     }

@@ -10,5 +10,6 @@ pub mod profile_table;
 pub mod sections;
 pub mod sizes;
 mod tap;
+pub mod work_counters;
 
 pub use tap::Tap;

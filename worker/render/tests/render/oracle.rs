@@ -20,10 +20,12 @@ use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
 use slabcast_render::Simd;
 use slabcast_render::oracle::serial;
+use slabcast_render::oracle::work_counters::count_work;
 use slabcast_render::region::{BrickSupply, Region, expected_bricks};
 use slabcast_render::tile::{self, Scratch};
 use slabcast_render::visibility::ClosingDepths;
 use slabcast_render::visibility::{Directory, VisibleBricks};
+use slabcast_render::work::{self, WorkCounters};
 use slabcast_render::{Frame, Scene};
 use std::cell::{Cell, RefCell};
 use std::sync::Arc;
@@ -178,6 +180,33 @@ fn in_regions(
     (picture, counted, asked, touched)
 }
 
+/// The frame in tiles whose work is counted.
+fn with_work(
+    frame: &Frame,
+    simd: Simd,
+    bricks: &[Arc<Brick>],
+    edge: i32,
+) -> (Picture, WorkCounters) {
+    let size = frame.view.size;
+    let directory = Directory::new(infos_of(bricks, &frame.scene.grid).into());
+    let visible = VisibleBricks::new(&frame.view, &Arc::new(directory));
+    let here = RefCell::new(vec![true; bricks.len()]);
+    let store = Store { bricks, here, stop_in: Cell::new(None) };
+    let mut picture = Picture { size, pixels: vec![[0.0; 4]; (size[0] * size[1]) as usize] };
+    let mut all = WorkCounters::new(size.map(|n| n as usize));
+    let (mut scratch, mut pixels) = Default::default();
+    for y in (0..size[1] as i32).step_by(edge as usize) {
+        for x in (0..size[0] as i32).step_by(edge as usize) {
+            let rect = Rect::new(x, y, x + edge, y + edge).intersect(&Rect::from_size(size));
+            let counted =
+                work::draw(frame, &visible, &store, simd, rect, true, &mut scratch, &mut pixels);
+            pixels.write(rect, size, &mut picture.pixels);
+            all.put(rect, &counted);
+        }
+    }
+    (picture, all)
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 120, ..ProptestConfig::default() })]
 
@@ -267,7 +296,7 @@ proptest! {
             Frame::new(Arc::new(Scene::new(&spec)), view)
         };
         let frame = make(true);
-        let want = serial::render(&frame, &bricks);
+        let (want, want_work) = count_work(&frame, &bricks);
         prop_assert!(want.pixels.iter().flatten().all(|x| x.is_finite() && (0.0..=1.0001).contains(x)));
         let run = bricks.iter().filter_map(|b| view.project(&b.tight_box(&frame.scene.grid)))
             .fold(SheetRange::default(), |r, p| r.union(p.sheets));
@@ -285,6 +314,11 @@ proptest! {
         prop_assert!(got == want, "without culling");
         let (got, counted) = tiled(&frame, Simd::detect(), &bricks, edge, &[run]);
         prop_assert!(got == want, "in one slab");
+
+        let same = with_work(&frame, Simd::detect(), &bricks, edge) == (want.clone(), want_work.clone());
+        prop_assert!(same, "in tiles whose work is counted");
+        let same = with_work(&make(false), Simd::plain(), &bricks, 64) == (want.clone(), want_work);
+        prop_assert!(same, "counted without culling");
 
         // All bricks here, none here at first, and coming and going; tiles handed over with what is
         // drawn of them.

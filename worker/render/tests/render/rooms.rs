@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 /// Rooms from the lowest up, each with what it may import of this crate besides itself.
-const ROOMS: [(&str, &[&str]); 10] = [
+const ROOMS: [(&str, &[&str]); 11] = [
     ("primitives", &[]),
     ("visibility", &["primitives"]),
     ("kernels", &["primitives", "visibility::open_mask"]),
@@ -12,6 +12,7 @@ const ROOMS: [(&str, &[&str]); 10] = [
     ("geometry", &["kernels", "part", "primitives", "scene", "visibility"]),
     ("tile", &["geometry", "kernels", "part", "primitives", "scene"]),
     ("region", &["kernels", "part", "primitives", "scene", "tile", "visibility"]),
+    ("work", &["kernels", "part", "primitives", "region", "scene", "tile", "visibility"]),
     ("oracle", &["kernels", "primitives", "scene"]),
     ("judge", &["kernels", "primitives", "scene", "tile"]),
 ];

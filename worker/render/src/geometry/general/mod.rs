@@ -498,7 +498,7 @@ impl General<'_> {
         pixels: &mut Pixels,
     ) -> bool {
         const { assert!(LANES == 2 * BLOCK) };
-        let rect = self.part.rect;
+        let (part, rect) = (self.part, self.part.rect);
         let mut mask = planes.touched(k);
         let mut any_shut = false;
         let mut row = Row::default();
@@ -526,8 +526,11 @@ impl General<'_> {
                     planes.load(k, (y + half) * PART as usize + x0, &mut row, half * BLOCK);
                 }
                 let live = (live[0] | live[1] << BLOCK) as u32;
-                let shut = contents.close_row(self.part, &mut row, (&at_pixel, k), live);
+                let shut = contents.close_row(part, &mut row, (&at_pixel, k), live);
                 put(Simd::plain(), &row, &places, &mut pixels.all);
+                if let Some(work) = &mut pixels.work {
+                    part.count_sheet(work, k, (&row, &places), [live, shut]);
+                }
                 for half in 0..2 {
                     let shut = u64::from(shut >> (half * BLOCK) & 0xff);
                     open.close(y + half, shut << x0);

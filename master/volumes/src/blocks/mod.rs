@@ -1,0 +1,147 @@
+//! Volumes read in boxes, at each level of a pyramid.
+//!
+//! A [`BlockSource`] gives samples of a volume without holding all of them: whoever cuts bricks, frames
+//! a path or halves a volume asks for the box it needs. Level 0 is the volume; each level after
+//! it has means of two samples along each axis (`mean`). A level is a volume of its own, with a
+//! lattice, a digest and a summary.
+//!
+//! Blocks of [`BLOCK_EDGE`] samples an edge are the unit of summaries: what values a block holds is
+//! known without its samples, so that blocks a transfer function does not show are never read.
+
+mod mean;
+mod memory;
+
+pub use mean::{halved, halved_lattice};
+pub use memory::MemorySource;
+
+use crate::error::Problem;
+use slabcast_common::transfer::Support;
+use slabcast_common::volume::{Samples, ValueSummary, VolumeInfo};
+use std::sync::Arc;
+
+/// Edge of a block in samples: eight bricks.
+pub const BLOCK_EDGE: u32 = 64;
+
+/// A volume whose samples are read box by box.
+///
+/// Functions may read files: callers run on threads of their own.
+pub trait BlockSource: Send + Sync {
+    /// Returns the name for people, without folders.
+    fn name(&self) -> &str;
+
+    /// Returns the number type of the samples in the file, for people (`int16`).
+    fn file_type(&self) -> &str;
+
+    /// Returns the levels, the finest first; there is at least one. Each has the digest of its own
+    /// samples ([`slabcast_common::volume::Volume::digest`]).
+    fn levels(&self) -> &[VolumeInfo];
+
+    /// Returns the samples of the box from `lo` to `hi` (exclusive), i fastest.
+    ///
+    /// # Errors
+    /// A file that can't be read, or is damaged.
+    ///
+    /// # Panics
+    /// If there is no such level, or the box is empty or reaches out of it.
+    fn read_box(&self, level: usize, lo: [u32; 3], hi: [u32; 3]) -> Result<Samples, Problem>;
+
+    /// Returns what each block of a level holds.
+    ///
+    /// # Errors
+    /// A file that can't be read, or is damaged.
+    ///
+    /// # Panics
+    /// If there is no such level.
+    fn summaries(&self, level: usize) -> Result<Arc<BlockSummaries>, Problem>;
+}
+
+/// Values that the samples of one block have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BlockSummary {
+    /// Bit `b` is set if some sample lies in bin `b` ([`ValueBins`]).
+    pub bins: u64,
+    /// Whether some sample is NaN.
+    pub nan: bool,
+}
+
+/// The summaries of all blocks of a level, i fastest.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BlockSummaries {
+    /// Number of blocks along i, j, k.
+    pub dims: [u32; 3],
+    /// Bins of the values.
+    pub bins: ValueBins,
+    /// A summary for each block.
+    pub all: Vec<BlockSummary>,
+}
+
+/// 64 bins of sample codes, in ascending order. What lies beyond the first or last edge is in the
+/// first or last bin.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ValueBins {
+    /// Code at which the first bin begins.
+    pub first_code: f64,
+    /// Width of a bin in codes; above zero.
+    pub width: f64,
+}
+
+impl ValueBins {
+    /// Returns bins over the values that nearly all samples have.
+    pub fn of(summary: &ValueSummary) -> ValueBins {
+        let (lo, hi) = match &summary.core {
+            Some(core) => (core.min_code, core.max_code),
+            None => (summary.min_code, summary.max_code),
+        };
+        let width = (hi - lo) / 64.0;
+        ValueBins { first_code: lo, width: if width > 0.0 { width } else { 1.0 } }
+    }
+
+    /// Returns the bin of a code that is not NaN, 0 to 63.
+    #[inline]
+    pub fn bin(&self, code: f64) -> u32 {
+        // The conversion saturates, at infinities too.
+        ((code - self.first_code) / self.width).clamp(0.0, 63.0) as u32
+    }
+
+    /// Returns the bins in which a support has codes.
+    pub fn mask(&self, support: &Support) -> u64 {
+        support.intervals.iter().fold(0, |mask, &(a, b)| {
+            let (first, last) = (self.bin(a), self.bin(b));
+            mask | (u64::MAX >> (63 - (last - first))) << first
+        })
+    }
+}
+
+impl BlockSummary {
+    /// Returns the summary of samples.
+    pub fn of(samples: &Samples, bins: &ValueBins) -> BlockSummary {
+        fn each<T: Copy + Into<f64>>(samples: &[T], bins: &ValueBins) -> BlockSummary {
+            samples.iter().fold(BlockSummary { bins: 0, nan: false }, |all, &code| {
+                let code: f64 = code.into();
+                if code.is_nan() {
+                    return BlockSummary { nan: true, ..all };
+                }
+                BlockSummary { bins: all.bins | 1 << bins.bin(code), ..all }
+            })
+        }
+        match samples {
+            Samples::U8(v) => each(v, bins),
+            Samples::U16(v) => each(v, bins),
+            Samples::F32(v) => each(v, bins),
+        }
+    }
+
+    /// Returns whether a block may hold a code of a support whose bins are `mask`
+    /// ([`ValueBins::mask`]).
+    pub fn meets(&self, mask: u64, support: &Support) -> bool {
+        self.bins & mask != 0 || (self.nan && support.nan)
+    }
+}
+
+/// Returns the number of blocks of a level along each axis.
+pub fn block_dims(dims: [u32; 3]) -> [u32; 3] {
+    dims.map(|n| n.div_ceil(BLOCK_EDGE))
+}
+
+#[cfg(test)]
+mod tests;

@@ -60,6 +60,20 @@ impl Lattice {
         DMat3::from_cols(self.steps[0], self.steps[1], self.steps[2])
     }
 
+    /// Returns the matrix that [`Volume::gradient`] takes: the transposed inverse of
+    /// `world_from_index`, scaled to vox so that no unit overflows it.
+    ///
+    /// Its numbers are rounded to f32. Gradients of integers are fractions of small numbers, and
+    /// some lie just between two codes of a normal. In another unit of length the matrix has other
+    /// last bits, and one gradient in 10^4 or so would flip to the next code (the test below counts
+    /// 44 in 5 10^5 without the rounding; two voxels make 1 % of a small picture differ).
+    pub fn gradient_matrix(&self) -> DMat3 {
+        let vox = self.vox();
+        let m = DMat3::from_cols(self.steps[0] / vox, self.steps[1] / vox, self.steps[2] / vox);
+        let m = m.inverse().transpose();
+        DMat3::from_cols_array(&m.to_cols_array().map(|x| f64::from(x as f32)))
+    }
+
     /// Returns the index coordinates of the centre of the volume's box.
     pub fn centre_index(&self) -> DVec3 {
         let [x, y, z] = self.dims.map(|n| (n as f64 - 1.0) / 2.0);
@@ -528,22 +542,9 @@ impl Volume {
         *index_to_world_gradient * g
     }
 
-    /// Returns the matrix that [`Volume::gradient`] takes: the transposed inverse of
-    /// `world_from_index`, scaled to vox so that no unit overflows it.
-    ///
-    /// Its numbers are rounded to f32. Gradients of integers are fractions of small numbers, and
-    /// some lie just between two codes of a normal. In another unit of length the matrix has other
-    /// last bits, and one gradient in 10^4 or so would flip to the next code (the test below counts
-    /// 44 in 5 10^5 without the rounding; two voxels make 1 % of a small picture differ).
+    /// Returns [`Lattice::gradient_matrix`].
     pub fn gradient_matrix(&self) -> DMat3 {
-        let vox = self.lattice.vox();
-        let m = DMat3::from_cols(
-            self.lattice.steps[0] / vox,
-            self.lattice.steps[1] / vox,
-            self.lattice.steps[2] / vox,
-        );
-        let m = m.inverse().transpose();
-        DMat3::from_cols_array(&m.to_cols_array().map(|x| f64::from(x as f32)))
+        self.lattice.gradient_matrix()
     }
 
     /// Returns the volume without its samples; `digest` is its [`Volume::digest`].

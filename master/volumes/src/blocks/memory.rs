@@ -4,24 +4,25 @@ use super::{BLOCK_EDGE, BlockSource, BlockSummaries, BlockSummary, ValueBins, bl
 use crate::error::Problem;
 use rayon::prelude::*;
 use slabcast_common::volume::{Digest32, Samples, Volume, VolumeInfo};
+use std::ops::Deref;
 use std::sync::{Arc, OnceLock};
 
-/// One level: a volume whose samples are in memory.
-pub struct MemorySource {
-    volume: Arc<Volume>,
+/// One level: a volume whose samples are in memory. `V` owns or borrows it.
+pub struct MemorySource<V = Arc<Volume>> {
+    volume: V,
     level: VolumeInfo,
     summaries: OnceLock<Arc<BlockSummaries>>,
 }
 
-impl MemorySource {
+impl<V: Deref<Target = Volume>> MemorySource<V> {
     /// Returns a source of one level; `digest` is the volume's.
-    pub fn new(volume: Arc<Volume>, digest: Digest32) -> MemorySource {
+    pub fn new(volume: V, digest: Digest32) -> MemorySource<V> {
         let level = volume.info(digest);
         MemorySource { volume, level, summaries: OnceLock::new() }
     }
 }
 
-impl BlockSource for MemorySource {
+impl<V: Deref<Target = Volume> + Send + Sync> BlockSource for MemorySource<V> {
     fn name(&self) -> &str {
         &self.volume.name
     }
@@ -42,6 +43,10 @@ impl BlockSource for MemorySource {
     fn summaries(&self, level: usize) -> Result<Arc<BlockSummaries>, Problem> {
         assert_eq!(level, 0, "a volume in memory has one level");
         Ok(self.summaries.get_or_init(|| Arc::new(summarise(&self.volume))).clone())
+    }
+
+    fn whole(&self, level: usize) -> Option<&Volume> {
+        (level == 0).then_some(&*self.volume)
     }
 }
 

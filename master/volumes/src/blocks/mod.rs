@@ -13,10 +13,11 @@ mod memory;
 
 pub use mean::{halved, halved_lattice};
 pub use memory::MemorySource;
+pub(crate) use memory::copy_box;
 
 use crate::error::Problem;
 use slabcast_common::transfer::Support;
-use slabcast_common::volume::{Samples, ValueSummary, VolumeInfo};
+use slabcast_common::volume::{Samples, ValueSummary, Volume, VolumeInfo};
 use std::sync::Arc;
 
 /// Edge of a block in samples: eight bricks.
@@ -53,6 +54,12 @@ pub trait BlockSource: Send + Sync {
     /// # Panics
     /// If there is no such level.
     fn summaries(&self, level: usize) -> Result<Arc<BlockSummaries>, Problem>;
+
+    /// Returns a level whose samples are all in memory; `None` of others.
+    fn whole(&self, level: usize) -> Option<&Volume> {
+        let _ = level;
+        None
+    }
 }
 
 /// Values that the samples of one block have.
@@ -121,7 +128,9 @@ impl BlockSummary {
                 if code.is_nan() {
                     return BlockSummary { nan: true, ..all };
                 }
-                BlockSummary { bins: all.bins | 1 << bins.bin(code), ..all }
+                // A support shows infinities if it shows any code.
+                let seen = if code.is_infinite() { u64::MAX } else { 1 << bins.bin(code) };
+                BlockSummary { bins: all.bins | seen, ..all }
             })
         }
         match samples {

@@ -61,7 +61,7 @@ fn boxes_are_those_of_the_volume_and_summaries_miss_no_value() {
 
 #[test]
 fn support_beyond_the_bins_meets_the_first_or_last() {
-    let samples = Samples::F32(vec![-5.0, 0.0, 6400.0, f32::INFINITY, f32::NAN]);
+    let samples = Samples::F32(vec![-5.0, 0.0, 6400.0, f32::NAN]);
     let bins = ValueBins { first_code: 0.0, width: 1.0 };
     let block = BlockSummary::of(&samples, &bins);
     assert_eq!((block.bins, block.nan), (1 | 1 << 63, true));
@@ -69,6 +69,8 @@ fn support_beyond_the_bins_meets_the_first_or_last() {
     assert!(block.meets(bins.mask(&support(&[(1000.0, 2000.0)], false)), &support(&[], false)));
     assert!(!block.meets(bins.mask(&support(&[(3.0, 9.0)], false)), &support(&[], false)));
     assert!(block.meets(0, &support(&[], true)), "NaN is shown");
+    let infinite = BlockSummary::of(&Samples::F32(vec![f32::NEG_INFINITY]), &bins);
+    assert_eq!(infinite, BlockSummary { bins: u64::MAX, nan: false }, "shown with any code");
     let flat = ValueSummary::from_samples(&Samples::U16(vec![7; 9]), ValueMap::IDENTITY);
     assert_eq!(ValueBins::of(&flat).bin(7.0), 0);
 }

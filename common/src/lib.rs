@@ -30,6 +30,7 @@
 //! assert!(projected.rect.width() < 64 && projected.sheets.len() >= 32);
 //! ```
 
+pub mod block_set;
 pub mod blocks;
 pub mod bounds;
 pub mod brick;

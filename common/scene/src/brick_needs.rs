@@ -6,10 +6,12 @@
 use crate::path::{CropBox, ViewPath};
 use crate::tween::Tween;
 use sha2::{Digest, Sha256};
+use slabcast_common::block_set::BlockSet;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::quality::{Classify, InvalidField, Keep, Kernel, Quality};
 use slabcast_common::transfer::{Classifier, Support, TransferFunction};
 use slabcast_common::volume::{Digest32, VolumeInfo};
+use std::sync::Arc;
 
 /// Index steps around a visible voxel whose voxels are stored where values are classified after
 /// reconstruction. A kernel reaches two steps; measured in docs/design/sharp.md.
@@ -33,6 +35,9 @@ pub struct BrickNeeds {
     pub coefficients: bool,
     /// Box outside of which no voxel is stored; `None` for the whole volume.
     pub crop: Option<CropBox>,
+    /// Blocks outside of which no brick is stored, since no frame shows them; `None` for the whole
+    /// volume.
+    pub window: Option<Arc<BlockSet>>,
 }
 
 impl BrickNeeds {
@@ -47,6 +52,7 @@ impl BrickNeeds {
                 halo: 0,
                 coefficients: false,
                 crop: None,
+                window: None,
             },
             Classify::After => BrickNeeds {
                 support: classifier.support().filled(&info.summary),
@@ -55,6 +61,7 @@ impl BrickNeeds {
                 halo: HALO,
                 coefficients: quality.kernel == Kernel::Interpolating,
                 crop: None,
+                window: None,
             },
         }
     }
@@ -84,6 +91,7 @@ impl BrickNeeds {
             halo: a.halo.max(b.halo),
             coefficients: a.coefficients || b.coefficients,
             crop: None,
+            window: None,
         });
         Ok(BrickNeeds { crop, ..union.unwrap_or_default() })
     }
@@ -116,6 +124,7 @@ impl BrickNeeds {
             && (self.normals || !other.normals)
             && (self.gradients || !other.gradients)
             && self.crop == other.crop
+            && self.window == other.window
     }
 
     /// Returns the key of the brick set of the volume with digest `volume`.
@@ -144,6 +153,10 @@ impl BrickNeeds {
                 h.update(x.to_le_bytes());
             }
         }
+        if let Some(window) = &self.window {
+            h.update(b"window");
+            window.words().iter().for_each(|word| h.update(word.to_le_bytes()));
+        }
         BrickSetKey(Digest32(h.finalize().into()))
     }
 }
@@ -162,6 +175,7 @@ mod tests {
             gradients: false,
             halo: 0,
             coefficients: false,
+            window: None,
             crop: crop.map(|c| {
                 let lattice = Lattice::from_spacing([9; 3], [1.0; 3]);
                 c.parse::<Crop>().unwrap().resolve(&lattice).unwrap()

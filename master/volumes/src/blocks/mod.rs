@@ -20,8 +20,7 @@ use slabcast_common::transfer::Support;
 use slabcast_common::volume::{Samples, ValueSummary, Volume, VolumeInfo};
 use std::sync::Arc;
 
-/// Edge of a block in samples: eight bricks.
-pub const BLOCK_EDGE: u32 = 64;
+pub use slabcast_common::block_set::{BLOCK_EDGE, block_dims};
 
 /// A volume whose samples are read box by box.
 ///
@@ -145,11 +144,6 @@ impl BlockSummary {
     pub fn meets(&self, mask: u64, support: &Support) -> bool {
         self.bins & mask != 0 || (self.nan && support.nan)
     }
-}
-
-/// Returns the number of blocks of a level along each axis.
-pub fn block_dims(dims: [u32; 3]) -> [u32; 3] {
-    dims.map(|n| n.div_ceil(BLOCK_EDGE))
 }
 
 #[cfg(test)]

@@ -353,7 +353,11 @@ fn cut_blocks(
         if !same.may_hold(block) {
             return Ok(None);
         }
-        let cut = match before.filter(|_| same.is_same(block)) {
+        // A block outside of the former window was not cut.
+        let was_cut = |before: &&BrickStore| {
+            before.needs.window.as_ref().is_none_or(|window| window.contains(block))
+        };
+        let cut = match before.filter(|_| same.is_same(block)).filter(was_cut) {
             Some(before) => before.blocks[block].clone(),
             None => CutBlock::new(cutting.block(block)?),
         };

@@ -1,8 +1,10 @@
 //! Which blocks hold bricks at all, and which an edit of a transfer function leaves as they are.
 
 use crate::blocks::{BlockSummaries, ValueBins};
+use slabcast_common::block_set::BlockSet;
 use slabcast_common::transfer::Support;
 use slabcast_scene::brick_needs::BrickNeeds;
+use std::sync::Arc;
 
 /// Answers for each block of a level.
 pub(super) struct SameBlocks<'a> {
@@ -13,6 +15,8 @@ pub(super) struct SameBlocks<'a> {
     changed: Option<(u64, bool)>,
     /// Whether values of neighbouring blocks count.
     has_halo: bool,
+    /// Blocks that may hold bricks; `None` if all may.
+    window: Option<Arc<BlockSet>>,
 }
 
 impl<'a> SameBlocks<'a> {
@@ -23,8 +27,12 @@ impl<'a> SameBlocks<'a> {
         before: Option<&BrickNeeds>,
     ) -> SameBlocks<'a> {
         let alike = |before: &&BrickNeeds| {
-            BrickNeeds { support: Support::default(), ..(*before).clone() }
-                == BrickNeeds { support: Support::default(), ..needs.clone() }
+            let but_for_blocks = |n: &BrickNeeds| BrickNeeds {
+                support: Support::default(),
+                window: None,
+                ..n.clone()
+            };
+            but_for_blocks(before) == but_for_blocks(needs)
         };
         let changed = before.filter(alike).map(|before| {
             let bins = changed_bins(&summaries.bins, &before.support, &needs.support);
@@ -35,12 +43,14 @@ impl<'a> SameBlocks<'a> {
             visible: (summaries.bins.mask(&needs.support), needs.support.nan),
             changed,
             has_halo: needs.halo > 0,
+            window: needs.window.clone(),
         }
     }
 
     /// Returns whether a block may hold a brick.
     pub(super) fn may_hold(&self, block: usize) -> bool {
-        self.meets(block, self.visible)
+        self.window.as_ref().is_none_or(|window| window.contains(block))
+            && self.meets(block, self.visible)
     }
 
     /// Returns whether a block has the same bricks as before.

@@ -1,5 +1,6 @@
 use super::*;
 use proptest::prelude::*;
+use slabcast_common::block_set::BlockSet;
 use slabcast_common::brick::local_position;
 use slabcast_common::gradient::encode_magnitude;
 use slabcast_common::shade::{NO_NORMAL, encode_normal};
@@ -14,17 +15,7 @@ fn span(a: f64, b: f64) -> Support {
 /// Builds a store and compares it with a plain loop over all voxels of the volume.
 fn check(volume: &Volume, support: &Support, normals: bool) -> BrickStore {
     let support = support.clone();
-    check_all(
-        volume,
-        &BrickNeeds {
-            support,
-            normals,
-            gradients: false,
-            halo: 0,
-            coefficients: false,
-            crop: None,
-        },
-    )
+    check_all(volume, &BrickNeeds { support, normals, ..BrickNeeds::default() })
 }
 
 fn check_all(volume: &Volume, needs: &BrickNeeds) -> BrickStore {
@@ -143,7 +134,8 @@ proptest! {
         });
         let gradients = seed % 3 == 0;
         let halo = seed % 4;
-        let needs = BrickNeeds { support, normals, gradients, halo, coefficients: false, crop };
+        let needs =
+            BrickNeeds { support, normals, gradients, halo, crop, ..BrickNeeds::default() };
         check_all(&volume, &needs);
     }
 }
@@ -199,14 +191,7 @@ fn relevance_table_matches_support_for_every_code() {
 #[test]
 fn brick_encoding_is_shared_between_threads() {
     let v = Volume::from_fn_u8("v", [32; 3], |i, j, k| (i * j + k) as u8 | 1);
-    let needs = BrickNeeds {
-        support: span(1.0, 255.0),
-        normals: true,
-        gradients: false,
-        halo: 0,
-        coefficients: false,
-        crop: None,
-    };
+    let needs = BrickNeeds { support: span(1.0, 255.0), normals: true, ..BrickNeeds::default() };
     let store = BrickStore::build(&v, Digest32::default(), &needs);
     let id = store.infos()[7].id;
     let seen: Vec<usize> = std::thread::scope(|s| {
@@ -303,5 +288,26 @@ fn blocks_meet_without_a_seam() {
             &volume,
             &BrickNeeds { support, normals, gradients: normals, halo, ..BrickNeeds::default() },
         );
+    }
+}
+
+#[test]
+fn window_holds_the_bricks_of_its_blocks_and_no_others() {
+    let volume = ramp();
+    let (digest, support) = (volume.digest(), span(20.0, 250.0));
+    let needs = BrickNeeds { support, halo: 2, ..BrickNeeds::default() };
+    let whole = BrickStore::build(&volume, digest, &needs);
+    let mut window = BlockSet::new(volume.lattice.dims);
+    [3, 4, 17].into_iter().for_each(|block| window.insert(block));
+    let needs = BrickNeeds { window: Some(Arc::new(window)), ..needs };
+    let part = BrickStore::build(&volume, digest, &needs);
+    assert_ne!(part.key(), whole.key());
+    for (block, (part, whole)) in part.blocks.iter().zip(&whole.blocks).enumerate() {
+        let infos = |b: &Option<Arc<CutBlock>>| b.as_ref().map(|b| b.infos.clone());
+        let is_in = [3, 4, 17].contains(&block);
+        assert_eq!(infos(part), infos(whole).filter(|_| is_in), "block {block}");
+    }
+    for info in part.infos().iter() {
+        assert_eq!(part.encoded(info.id), whole.encoded(info.id));
     }
 }

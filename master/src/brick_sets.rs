@@ -120,6 +120,11 @@ impl BrickSets {
         self.cutting = None;
     }
 
+    /// Forgets a set whose bricks can't be read any more.
+    pub(crate) fn forget(&mut self, key: BrickSetKey) {
+        self.sets.retain(|held| held.store.key() != key);
+    }
+
     /// Bytes of all sets that are held.
     fn bytes(&self) -> u64 {
         self.sets.iter().map(|held| held.store.bytes()).sum()

@@ -379,6 +379,11 @@ impl Driver {
     /// Fails the jobs whose set can't be cut.
     fn no_bricks(&mut self, set: BrickSetKey, reason: &str) {
         self.brick_sets.cut_failed();
+        self.fail_jobs_of(set, reason);
+    }
+
+    /// Fails the jobs that draw from a set.
+    pub(super) fn fail_jobs_of(&mut self, set: BrickSetKey, reason: &str) {
         let hit = |id: &JobId| self.active.get(*id).is_some_and(|job| job.scene.bricks == set);
         let jobs: Vec<JobId> = self.active.ids().filter(hit).collect();
         for job in jobs {

@@ -39,6 +39,7 @@ pub mod gradient;
 pub mod ids;
 pub mod image;
 pub mod kernel;
+pub mod level;
 pub mod link;
 pub mod lookahead;
 pub mod math;

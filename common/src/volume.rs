@@ -85,6 +85,18 @@ impl Lattice {
         self.origin + self.world_from_index() * self.centre_index()
     }
 
+    /// Returns the world vector from the centre of this lattice's box to that of `other`, which is
+    /// another level of the same volume.
+    ///
+    /// Rounded to 1/65536 of a step, so that a far origin leaves no noise in it.
+    pub fn to_centre_of(&self, other: &Lattice) -> DVec3 {
+        let between = (other.origin - self.origin)
+            + (other.world_from_index() * other.centre_index()
+                - self.world_from_index() * self.centre_index());
+        let steps = self.world_from_index().inverse() * between;
+        self.world_from_index() * ((steps * 65536.0).round() / 65536.0)
+    }
+
     /// Returns the largest extent in world units (N samples count as N spacings).
     pub fn largest_extent(&self) -> f64 {
         let s = self.spacing();
@@ -467,8 +479,20 @@ pub struct Volume {
     pub lattice: Lattice,
     /// The samples, i fastest, then j, then k.
     pub samples: Samples,
-    /// Range, histogram, and map from codes to values.
+    /// Range, histogram, and map from codes to values. Of a coarser level that of level 0.
     pub summary: ValueSummary,
+    /// Place among the levels of detail of a volume; `None` of level 0.
+    pub coarse: Option<CoarseLevel>,
+}
+
+/// Place of a volume among the levels of detail of a finer one (docs/design/model.md, Levels of
+/// detail).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CoarseLevel {
+    /// Number of the level, 1 or more.
+    pub level: u32,
+    /// Length of one vox of level 0, in world units.
+    pub finest_vox: f64,
 }
 
 impl Volume {
@@ -493,6 +517,7 @@ impl Volume {
             lattice,
             samples,
             summary,
+            coarse: None,
         }
     }
 
@@ -510,15 +535,19 @@ impl Volume {
         Volume::new(name, "uint8", false, lattice, Samples::U8(v), ValueMap::IDENTITY)
     }
 
-    /// Returns the SHA-256 over lattice, value map and samples. Two volumes with one digest give
-    /// the same pictures; the name is not part of it.
+    /// Returns the SHA-256 over lattice, value map and samples; of a coarser level also over what
+    /// level 0 gives it. Two volumes with one digest give the same pictures; the name is not part
+    /// of it.
     pub fn digest(&self) -> Digest32 {
         let mut hasher = VolumeHasher::new(&self.lattice, self.summary.map, self.samples.kind());
         let count = self.samples.len();
         for begin in (0..count).step_by(1 << 15) {
             hasher.update(&self.samples.le_bytes(begin..count.min(begin + (1 << 15))));
         }
-        hasher.finish()
+        match &self.coarse {
+            None => hasher.finish(),
+            Some(coarse) => hasher.finish_level(coarse, &self.summary),
+        }
     }
 
     /// Returns the gradient of the raw field at sample (i, j, k) in world axes, in codes per vox:
@@ -549,7 +578,12 @@ impl Volume {
 
     /// Returns the volume without its samples; `digest` is its [`Volume::digest`].
     pub fn info(&self, digest: Digest32) -> VolumeInfo {
-        VolumeInfo { digest, lattice: self.lattice, summary: self.summary.clone() }
+        let (level, finest_vox) = match self.coarse {
+            Some(CoarseLevel { level, finest_vox }) => (level, finest_vox),
+            None => (0, self.lattice.vox()),
+        };
+        let summary = self.summary.clone();
+        VolumeInfo { digest, lattice: self.lattice, summary, level, finest_vox }
     }
 }
 
@@ -592,6 +626,20 @@ impl VolumeHasher {
     pub fn finish(self) -> Digest32 {
         Digest32(self.0.finalize().into())
     }
+
+    /// Returns the digest of a coarser level whose samples were added. `summary` is that of level 0,
+    /// of which range and opacities are.
+    pub fn finish_level(mut self, coarse: &CoarseLevel, summary: &ValueSummary) -> Digest32 {
+        self.0.update(b"level");
+        self.0.update(coarse.level.to_le_bytes());
+        for x in [coarse.finest_vox, summary.min_code, summary.max_code] {
+            self.0.update(x.to_le_bytes());
+        }
+        for n in summary.histogram.iter().chain([&summary.nan, &summary.infinite]) {
+            self.0.update(n.to_le_bytes());
+        }
+        self.finish()
+    }
 }
 
 /// A volume without its samples: what master, workers and clients share.
@@ -601,8 +649,36 @@ pub struct VolumeInfo {
     pub digest: Digest32,
     /// Lattice that the samples lie on.
     pub lattice: Lattice,
-    /// Range, histogram, and map from codes to values.
+    /// Range, histogram, and map from codes to values; of each level those of level 0.
     pub summary: ValueSummary,
+    /// Level of detail: 0 is the volume as it was read, each level after it is coarser.
+    pub level: u32,
+    /// Length of one vox of level 0 in world units; of level 0 itself [`Lattice::vox`].
+    pub finest_vox: f64,
+}
+
+impl VolumeInfo {
+    /// Returns the place among the levels of detail; `None` of level 0.
+    pub fn coarse(&self) -> Option<CoarseLevel> {
+        let (level, finest_vox) = (self.level, self.finest_vox);
+        (level > 0).then_some(CoarseLevel { level, finest_vox })
+    }
+
+    /// Returns [`Volume::digest`] of a volume with this description, whose samples `hasher` was given.
+    pub fn finish(&self, hasher: VolumeHasher) -> Digest32 {
+        match self.coarse() {
+            None => hasher.finish(),
+            Some(coarse) => hasher.finish_level(&coarse, &self.summary),
+        }
+    }
+
+    /// Returns the length of a vox of this level in vox of level 0; exactly 1 of level 0.
+    ///
+    /// Opacities and gradients of transfer functions are per vox of level 0. Whatever is counted per
+    /// vox of this level is multiplied or divided by this.
+    pub fn coarseness(&self) -> f64 {
+        if self.level == 0 { 1.0 } else { self.lattice.vox() / self.finest_vox }
+    }
 }
 
 /// A SHA-256 digest of 32 bytes, shown as 64 hexadecimal digits.

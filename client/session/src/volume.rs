@@ -4,6 +4,7 @@
 use crate::fail::Fail;
 use crate::parse;
 use crate::progress;
+use slabcast_common::level::LevelChoice;
 use slabcast_common::volume::Volume;
 use slabcast_volumes::{FileNumbers, Hints, OpenError, Opened, Pick, RawHints};
 use std::ffi::OsString;
@@ -44,10 +45,14 @@ pub struct InputArgs {
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     dataset: Option<String>,
-    /// Which level of an OME-Zarr pyramid, 0 the finest [default: the finest that fits]
-    #[arg(long, value_name = "N", allow_negative_numbers = true, help_heading = HEADING,
-          hide_short_help = true)]
-    level: Option<u32>,
+    /// Level of detail: auto, or 0 (all) and up, each half as fine [default: 0]
+    ///
+    /// auto draws at the level at which a sample covers about a pixel in the nearest view, which is
+    /// faster and looks alike. Of an OME-Zarr picture level N of the file is read, by default the
+    /// finest that fits into memory.
+    #[arg(long, value_name = "auto|N", value_parser = parse::level, allow_negative_numbers = true,
+          help_heading = HEADING)]
+    level: Option<LevelChoice>,
     /// Most bytes that the samples may take [default: 1 GiB or 64 times the file, in free memory]
     #[arg(long, value_name = "BYTES", value_parser = parse::memory, help_heading = HEADING,
           hide_short_help = true)]
@@ -97,16 +102,24 @@ impl InputArgs {
             series: self.series.clone(),
             dataset: self.dataset.clone(),
             dicom_reader: dicom_reader(),
-            level: self.level,
+            level: match self.level {
+                Some(LevelChoice::At(level)) => Some(level),
+                Some(LevelChoice::Auto) | None => None,
+            },
             max_bytes: self.max_bytes,
             pick: self.pick.pick(),
             ..Hints::default()
         }
     }
 
-    /// Returns whether none of the flags is given.
+    /// Returns whether no flag says what is in a file. A level of detail does not.
     pub fn is_empty(&self) -> bool {
-        *self == InputArgs::default()
+        InputArgs { level: None, ..self.clone() } == InputArgs::default()
+    }
+
+    /// Returns the level of detail to draw.
+    pub fn level(&self) -> LevelChoice {
+        self.level.unwrap_or_default()
     }
 
     /// Opens a file, a folder or a `formula:` volume and prints notes about it.

@@ -5,6 +5,7 @@
 
 use crate::path::{CropBox, ViewPath};
 use crate::tween::Tween;
+use glam::DVec3;
 use sha2::{Digest, Sha256};
 use slabcast_common::block_set::BlockSet;
 use slabcast_common::brick::BrickSetKey;
@@ -105,6 +106,14 @@ impl BrickNeeds {
         }
         self.normals |= keep.normals;
         self.gradients |= keep.gradients;
+        self
+    }
+
+    /// Returns the needs of a level of detail whose box has its centre at `centre`, a world vector from
+    /// that of level 0, to which cropping boxes are relative.
+    #[must_use]
+    pub fn at_centre(mut self, centre: DVec3) -> BrickNeeds {
+        self.crop = self.crop.map(|crop| CropBox { lo: crop.lo - centre, hi: crop.hi - centre });
         self
     }
 

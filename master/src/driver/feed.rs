@@ -19,14 +19,13 @@
 use super::{Driver, Event, Flight};
 use crate::hooks::Stage;
 use crate::jobs::active::Candidate;
-use crate::library::{Viewer, VolumeError};
+use crate::library::VolumeError;
 use crate::memory::{Shares, brick_set_bytes, making_bytes};
 use crate::panics::caught;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, JobId};
 use slabcast_common::link::{FRAMES_IN_FLIGHT, MOST_FRAMES_IN_FLIGHT};
 use slabcast_common::quality::Schedule;
-use slabcast_scene::request::VolumeChoice;
 use slabcast_schedule::{Clock, Event as Happened, FrameJob, Micros};
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
@@ -350,7 +349,7 @@ impl Driver {
             let store = caught("cutting bricks", || {
                 hooks.reach(Stage::CutBricks);
                 // Its samples may have been dropped since the job was submitted.
-                let volume = library.open(&VolumeChoice::Digest(digest), Viewer::own())?.volume;
+                let volume = library.samples(digest)?;
                 Ok(Arc::new(BrickStore::build(&volume, digest, &needs)))
             });
             let store = store

@@ -10,6 +10,7 @@
 //! Every function here may read a file or wait for one: callers run on threads of their own, never on
 //! the driver's or the runtime's.
 
+mod levels;
 mod stored;
 #[cfg(test)]
 mod tests;
@@ -173,6 +174,8 @@ pub struct Library {
 #[derive(Default)]
 struct Entries {
     by_name: BTreeMap<String, Entry>,
+    /// Levels of these volumes that were computed, by digest.
+    levels: BTreeMap<Digest32, levels::Level>,
     /// Counts uses.
     clock: u64,
 }
@@ -672,7 +675,8 @@ impl Entries {
     /// Bytes of the samples in memory that may be dropped.
     fn held_bytes(&self) -> u64 {
         let held = self.by_name.values().filter(|e| e.may_be_dropped());
-        held.filter_map(|e| e.served.as_ref()).map(|s| sample_bytes(&s.info)).sum()
+        let bytes = held.filter_map(|e| e.served.as_ref()).map(|s| sample_bytes(&s.info));
+        bytes.sum::<u64>() + self.level_bytes()
     }
 
     /// Bytes of the files of uploads.
@@ -683,9 +687,17 @@ impl Entries {
 
     /// Drops the samples that were unused for longest. False if there are none to drop.
     fn drop_oldest(&mut self) -> bool {
+        let level = self.oldest_level();
         let held = self.by_name.values_mut().filter(|e| e.may_be_dropped());
-        let Some(oldest) = held.min_by_key(|e| e.used) else { return false };
-        oldest.samples = None;
+        let file = held.min_by_key(|e| e.used);
+        match (level, file) {
+            (None, None) => return false,
+            (Some((used, digest)), file) if file.as_ref().is_none_or(|f| used < f.used) => {
+                self.drop_level(digest);
+            }
+            (_, Some(file)) => file.samples = None,
+            (Some(_), None) => unreachable!("a level goes where there is no file"),
+        }
         true
     }
 }

@@ -90,8 +90,9 @@ pub(super) fn read(path: &Path, most_bytes: u64) -> Result<(Volume, Orientation)
     let samples = read_samples(path, &header)
         .map_err(|e| unreadable(format!("{}: its file: {e}", header.name), false))?;
     let VolumeHeader { name, file_type, info, orientation } = header;
-    let (lattice, summary) = (info.lattice, info.summary);
+    let (coarse, lattice, summary) = (info.coarse(), info.lattice, info.summary);
     let volume = Volume::new(name, file_type, summary.anatomical, lattice, samples, summary.map);
+    let volume = Volume { coarse, ..volume };
     if volume.digest() != info.digest {
         let reason = format!(
             "{}: its file is damaged: the digest of its samples is another; remove it and upload it \

@@ -40,6 +40,7 @@
 //! This crate has no network, no clock, and knows neither tasks, views nor colours. It does use
 //! threads, since cutting bricks is work for all cores.
 
+pub mod auto_level;
 pub mod blocks;
 mod data;
 #[cfg(feature = "dicom")]

@@ -174,6 +174,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     }
     let crew = WorkerGroup::new(args.workers.unwrap_or(1), args.threads)?;
     let mut request = args.scene.request_with_turn(args.work.work()?, usual_turn(args)?)?;
+    request.level = args.input.level();
     let mut notes = Vec::new();
     if let Some(like) = &args.like {
         let other = volume::open(like)?.info(Digest32::default());

@@ -438,6 +438,30 @@ impl VolumeSceneArgs {
         self.input.is_empty()
     }
 
+    /// Returns the request of a command that draws in the quality that is given.
+    ///
+    /// # Errors
+    /// A flag or file is wrong in itself, or a quality target is given.
+    pub fn request(&self, work: Work) -> Result<RenderRequest, Fail> {
+        Ok(RenderRequest { level: self.input.level(), ..self.scene.request(work)? })
+    }
+
+    /// Returns the request of a command about the paper's order, as [`SceneArgs::request_before`].
+    ///
+    /// # Errors
+    /// As [`SceneArgs::request_before`].
+    pub fn request_before(&self, work: Work) -> Result<RenderRequest, Fail> {
+        Ok(RenderRequest { level: self.input.level(), ..self.scene.request_before(work)? })
+    }
+
+    /// Returns the request of a command that can choose the quality by a target.
+    ///
+    /// # Errors
+    /// A flag or file is wrong in itself.
+    pub fn request_with_target(&self, work: Work) -> Result<RenderRequest, Fail> {
+        Ok(RenderRequest { level: self.input.level(), ..self.scene.request_with_target(work)? })
+    }
+
     /// Opens the volume and checks that the request can be drawn of it.
     ///
     /// # Errors

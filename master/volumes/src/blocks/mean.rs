@@ -6,7 +6,8 @@
 //! others are as thick. Where a side has an odd number of samples, the last mean is over those there
 //! are.
 
-use slabcast_common::volume::{Lattice, Samples};
+use rayon::prelude::*;
+use slabcast_common::volume::{CoarseLevel, Lattice, Samples, Volume};
 
 /// Returns the lattice of the next coarser level; `None` if no axis can be halved.
 pub fn halved_lattice(lattice: &Lattice) -> Option<Lattice> {
@@ -31,8 +32,28 @@ fn halved_axes(lattice: &Lattice) -> [bool; 3] {
     std::array::from_fn(|a| dims[a] > 1 && spacing[a] < 2.0 * smallest)
 }
 
-/// Returns the samples of the next coarser level of a box of samples. `fine` has samples on a box of
-/// `dims` samples of `lattice`, i fastest, which begins at an even index along each halved axis.
+/// Returns the next coarser level of a volume; `None` if no axis can be halved. It keeps the summary
+/// of level 0.
+///
+/// Memory: the coarser samples, beside those of `fine`.
+pub fn coarser(fine: &Volume) -> Option<Volume> {
+    let lattice = halved_lattice(&fine.lattice)?;
+    let finest_vox = fine.coarse.map_or_else(|| fine.lattice.vox(), |coarse| coarse.finest_vox);
+    let level = fine.coarse.map_or(0, |coarse| coarse.level) + 1;
+    Some(Volume {
+        name: fine.name.clone(),
+        file_type: fine.file_type.clone(),
+        anatomical: fine.anatomical,
+        lattice,
+        samples: halved(&fine.lattice, fine.lattice.dims, &fine.samples),
+        summary: fine.summary.clone(),
+        coarse: Some(CoarseLevel { level, finest_vox }),
+    })
+}
+
+/// Returns the samples of the next coarser level of a box of samples, on all cores of rayon's pool.
+/// `fine` has samples on a box of `dims` samples of `lattice`, i fastest, which begins at an even
+/// index along each halved axis.
 ///
 /// # Panics
 /// If the samples and `dims` differ in number, or the lattice can't be halved.
@@ -41,59 +62,89 @@ pub fn halved(lattice: &Lattice, dims: [u32; 3], fine: &Samples) -> Samples {
     assert_ne!(axes, [false; 3], "a lattice that can be halved");
     assert_eq!(fine.len(), dims.iter().map(|&n| n as usize).product::<usize>(), "whole boxes");
     match fine {
-        Samples::U8(v) => {
-            Samples::U8(means(axes, dims, v, |sum: u64, n| ((sum + n / 2) / n) as u8))
-        }
-        Samples::U16(v) => {
-            Samples::U16(means(axes, dims, v, |sum: u64, n| ((sum + n / 2) / n) as u16))
-        }
-        Samples::F32(v) => Samples::F32(float_means(axes, dims, v)),
+        Samples::U8(v) => Samples::U8(rows(axes, dims, v, integer_row)),
+        Samples::U16(v) => Samples::U16(rows(axes, dims, v, integer_row)),
+        Samples::F32(v) => Samples::F32(rows(axes, dims, v, float_row)),
     }
 }
 
-/// Calls `each` with the offsets of the samples under each coarse sample, i fastest.
-fn groups(axes: [bool; 3], dims: [u32; 3], mut each: impl FnMut(&[usize])) {
-    let [nx, ny, nz] = dims.map(|n| n as usize);
-    let step = axes.map(|halved| if halved { 2 } else { 1 });
-    let mut group = Vec::with_capacity(8);
-    for z in (0..nz).step_by(step[2]) {
-        for y in (0..ny).step_by(step[1]) {
-            for x in (0..nx).step_by(step[0]) {
-                group.clear();
-                for k in z..(z + step[2]).min(nz) {
-                    for j in y..(y + step[1]).min(ny) {
-                        for i in x..(x + step[0]).min(nx) {
-                            group.push((k * ny + j) * nx + i);
-                        }
-                    }
-                }
-                each(&group);
-            }
-        }
-    }
-}
-
-fn means<T: Copy + Into<u64>>(
+/// Calls `row` for each coarse row with the fine rows under it, in the order of z, then y, with
+/// whether x is halved, and with the coarse samples to write.
+fn rows<T: Copy + Default + Send + Sync>(
     axes: [bool; 3],
     dims: [u32; 3],
     fine: &[T],
-    round: impl Fn(u64, u64) -> T,
+    row: impl Fn(&[&[T]], bool, &mut [T]) + Sync,
 ) -> Vec<T> {
-    let mut coarse = Vec::new();
-    groups(axes, dims, |group| {
-        let sum = group.iter().map(|&i| fine[i].into()).sum();
-        coarse.push(round(sum, group.len() as u64));
+    let [nx, ny, nz] = dims.map(|n| n as usize);
+    let step = axes.map(|halved| if halved { 2 } else { 1 });
+    let [cx, cy, cz] = std::array::from_fn(|a| [nx, ny, nz][a].div_ceil(step[a]));
+    let mut coarse = vec![T::default(); cx * cy * cz];
+    coarse.par_chunks_mut(cx * cy).enumerate().for_each(|(z, slice)| {
+        for (y, to) in slice.chunks_mut(cx).enumerate() {
+            let mut under: [&[T]; 4] = [&[]; 4];
+            let mut count = 0;
+            for k in z * step[2]..((z + 1) * step[2]).min(nz) {
+                for j in y * step[1]..((y + 1) * step[1]).min(ny) {
+                    under[count] = &fine[(k * ny + j) * nx..][..nx];
+                    count += 1;
+                }
+            }
+            row(&under[..count], axes[0], to);
+        }
     });
     coarse
 }
 
+/// Means rounded half up. Eight codes of 16 bits add up to less than 2^19.
+fn integer_row<T: Copy + Into<u32> + TryFrom<u32>>(under: &[&[T]], halve_x: bool, to: &mut [T]) {
+    let mean = |sum: u32, n: u32| {
+        T::try_from((sum + n / 2) / n).unwrap_or_else(|_| unreachable!("a mean of codes is a code"))
+    };
+    let in_row = if halve_x { 2 } else { 1 };
+    // Whole groups of eight and four samples, the usual ones, with a constant divisor.
+    let whole = if halve_x { under[0].len() / 2 } else { to.len() };
+    match *under {
+        [a, b, c, d] if halve_x => {
+            for (x, to) in to[..whole].iter_mut().enumerate() {
+                let pair = |row: &[T]| row[2 * x].into() + row[2 * x + 1].into();
+                *to = mean(pair(a) + pair(b) + pair(c) + pair(d), 8);
+            }
+        }
+        [a, b] if halve_x => {
+            for (x, to) in to[..whole].iter_mut().enumerate() {
+                let pair = |row: &[T]| row[2 * x].into() + row[2 * x + 1].into();
+                *to = mean(pair(a) + pair(b), 4);
+            }
+        }
+        _ => {
+            for (x, to) in to[..whole].iter_mut().enumerate() {
+                let all = under.iter().flat_map(|row| &row[x * in_row..(x + 1) * in_row]);
+                let sum = all.map(|&code| -> u32 { code.into() }).sum();
+                *to = mean(sum, (under.len() * in_row) as u32);
+            }
+        }
+    }
+    // The last sample of an odd side.
+    for (x, to) in to.iter_mut().enumerate().skip(whole) {
+        let sum = under.iter().map(|row| -> u32 { row[x * in_row].into() }).sum();
+        *to = mean(sum, under.len() as u32);
+    }
+}
+
 /// Means of the finite samples; of samples without a finite one the first is taken.
-fn float_means(axes: [bool; 3], dims: [u32; 3], fine: &[f32]) -> Vec<f32> {
-    let mut coarse = Vec::new();
-    groups(axes, dims, |group| {
-        let finite = || group.iter().map(|&i| f64::from(fine[i])).filter(|x| x.is_finite());
-        let n = finite().count();
-        coarse.push(if n > 0 { (finite().sum::<f64>() / n as f64) as f32 } else { fine[group[0]] });
-    });
-    coarse
+fn float_row(under: &[&[f32]], halve_x: bool, to: &mut [f32]) {
+    let in_row = if halve_x { 2 } else { 1 };
+    for (x, to) in to.iter_mut().enumerate() {
+        let (mut sum, mut n) = (0.0f64, 0u32);
+        for row in under {
+            for &value in &row[x * in_row..((x + 1) * in_row).min(row.len())] {
+                if value.is_finite() {
+                    sum += f64::from(value);
+                    n += 1;
+                }
+            }
+        }
+        *to = if n > 0 { (sum / f64::from(n)) as f32 } else { under[0][x * in_row] };
+    }
 }

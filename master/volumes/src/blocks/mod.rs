@@ -11,7 +11,7 @@
 mod mean;
 mod memory;
 
-pub use mean::{halved, halved_lattice};
+pub use mean::{coarser, halved, halved_lattice};
 pub use memory::MemorySource;
 pub(crate) use memory::copy_box;
 

@@ -22,7 +22,7 @@ use crate::{Hints, Opened};
 use array::Array;
 use json::{Json, path};
 use serde_json::Value;
-use slabcast_common::volume::{Lattice, Volume};
+use slabcast_common::volume::{CoarseLevel, Lattice, Volume};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -117,7 +117,17 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
             count - 1
         ));
     }
-    read(array, placed, &name, notes, hints.cap())
+    // Opacities are of the finest level, whatever is drawn.
+    let vox = |placed: &Placed| placed.spacing.into_iter().fold(f64::INFINITY, f64::min);
+    let finest_vox = match level {
+        0 => vox(&placed),
+        _ => open(0)
+            .map_or_else(|_| vox(&placed) / f64::from(1u32 << level.min(31)), |(_, p)| vox(&p)),
+    };
+    let coarse = (level > 0).then_some(CoarseLevel { level: level as u32, finest_vox });
+    let mut opened = read(array, placed, &name, notes, hints.cap())?;
+    opened.volume.coarse = coarse;
+    Ok(opened)
 }
 
 fn read(

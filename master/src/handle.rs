@@ -269,8 +269,7 @@ impl Handle {
             caught("checking the request", || {
                 hooks.reach(Stage::Plan);
                 let open = library.open(&request.volume, viewer)?;
-                let of = (&*open.served, &*open.volume);
-                Plan::new(request, of, |level| library.level(&open, level), &shares)
+                Plan::new(request, &open, |level| library.level(&open, level), &shares)
             })
         });
         let plan = planned.await.ok_or(SubmitError::Gone)?;

@@ -6,9 +6,11 @@ use crate::parse;
 use crate::progress;
 use slabcast_common::level::LevelChoice;
 use slabcast_common::volume::Volume;
+use slabcast_volumes::blocks::{BlockSource, MemorySource};
 use slabcast_volumes::{FileNumbers, Hints, OpenError, Opened, Pick, RawHints};
 use std::ffi::OsString;
 use std::path::Path;
+use std::sync::Arc;
 
 /// Help text of every command's volume argument.
 pub const VOLUME: &str = "Volume file, folder with a stack or series, or formula:NAME";
@@ -132,6 +134,14 @@ impl InputArgs {
         Ok(opened.volume)
     }
 
+    /// Opens a volume like [`InputArgs::open`] as a source of boxes: in memory, or in its file.
+    ///
+    /// # Errors
+    /// Those of [`InputArgs::open`].
+    pub fn open_source(&self, path: &Path) -> Result<Arc<dyn BlockSource>, Fail> {
+        Ok(Arc::new(MemorySource::of(self.open(path)?)))
+    }
+
     /// Opens a volume like [`InputArgs::open`], to write it: with the file's own numbers where the
     /// volume's codes round them.
     ///
@@ -151,11 +161,15 @@ impl InputArgs {
     ///
     /// # Errors
     /// The volume can't be read.
-    pub fn read(&self, path: &Path, most_bytes: u64) -> Result<(Volume, Vec<String>), OpenError> {
+    pub fn read(
+        &self,
+        path: &Path,
+        most_bytes: u64,
+    ) -> Result<(Arc<dyn BlockSource>, Vec<String>), OpenError> {
         let mut hints = self.hints();
         hints.max_bytes = Some(hints.max_bytes.map_or(most_bytes, |asked| asked.min(most_bytes)));
         let opened = slabcast_volumes::open_with(path, &hints)?;
-        Ok((opened.volume, opened.notes))
+        Ok((Arc::new(MemorySource::of(opened.volume)), opened.notes))
     }
 }
 

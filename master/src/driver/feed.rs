@@ -334,7 +334,8 @@ impl Driver {
         let table = self.jobs.lock();
         let is_needed = |key| self.active.open_need(&table, key);
         let stays = |key| in_flight(key) || (!comes_first && is_needed(key));
-        let (bytes, digest) = (brick_set_bytes(volume, &needs), volume.digest);
+        let digest = volume.digest;
+        let bytes = brick_set_bytes(volume, &needs).min(self.shares.bricks);
         let begins = self.brick_sets.begin_cut(key, bytes, now, stays, is_needed);
         drop(table);
         if !begins && comes_first {
@@ -343,14 +344,18 @@ impl Driver {
         if !begins {
             return;
         }
-        let library = self.library.clone();
+        let before = self.brick_sets.latest_of(digest);
+        let (library, shares) = (self.library.clone(), self.shares);
         let (inbox, hooks) = (self.inbox.clone(), self.hooks.clone());
         let cut = move || {
             let store = caught("cutting bricks", || {
                 hooks.reach(Stage::CutBricks);
                 // Its samples may have been dropped since the job was submitted.
-                let volume = library.samples(digest)?;
-                Ok(Arc::new(BrickStore::build(&volume, digest, &needs)))
+                let open = library.open_level(digest)?;
+                let kept = shares.bricks_kept(&open);
+                let store =
+                    BrickStore::cut(&open.source, open.level, &needs, before.as_deref(), kept);
+                store.map(Arc::new).map_err(|e| VolumeError::NotReadable(e.to_string()))
             });
             let store = store
                 .map_err(|panicked| panicked.to_string())

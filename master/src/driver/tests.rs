@@ -396,9 +396,8 @@ async fn job_takes_memory_for_its_request_and_not_for_its_frames() {
     let open = handle.library().open(&VolumeChoice::Default, Viewer::own()).expect("it is there");
     let mut held = [0; 2];
     for (held, (key, frames)) in held.iter_mut().zip([("short", 1), ("long", 100_000)]) {
-        let of = (&*open.served, &*open.volume);
         let level = |_| unreachable!("level 0 is there");
-        let plan = Plan::new(request(key, frames, "grey"), of, level, &Shares::default());
+        let plan = Plan::new(request(key, frames, "grey"), &open, level, &Shares::default());
         *held = plan.expect("a good request").held_bytes();
     }
     assert!(held[1] < 8192 && held[1].abs_diff(held[0]) < 16, "{held:?} bytes");

@@ -6,9 +6,9 @@
 //! ([`crate::Handle::submit`]) and the driver gets the finished plan.
 
 use super::active::ActiveJob;
-use super::{Job, JobState, JobView};
+use super::{Job, JobState, JobView, window};
 use crate::handle::unix_ms;
-use crate::library::{OpenVolume, ServedVolume, VolumeError};
+use crate::library::{OpenVolume, VolumeError};
 use crate::memory::Shares;
 use glam::DVec3;
 use slabcast_common::ids::{JobId, SceneId};
@@ -17,7 +17,7 @@ use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{InvalidField, Quality};
 use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
-use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
+use slabcast_common::volume::{Digest32, VolumeInfo};
 use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_scene::path::{Framing, Prepared, ViewPath};
 use slabcast_scene::presets;
@@ -25,7 +25,7 @@ use slabcast_scene::request::{PathRequest, function_bytes};
 use slabcast_scene::transfer::TransferChoice;
 use slabcast_scene::tween::Tween;
 use slabcast_volumes::auto_level::AutoLevel;
-use slabcast_volumes::framing::framing;
+use slabcast_volumes::framing::{FramingError, framing_of};
 use std::sync::Arc;
 
 /// Bytes of the longest `client_key`.
@@ -58,6 +58,17 @@ pub enum SubmitError {
     /// Checking the request panicked: a mistake of this program, with the panic's message.
     #[error("{0}; this is a bug of slabcast")]
     Panicked(String),
+}
+
+impl From<FramingError> for SubmitError {
+    fn from(error: FramingError) -> SubmitError {
+        match error {
+            FramingError::Field(field) => SubmitError::Refused(field),
+            FramingError::File(problem) => {
+                SubmitError::Volume(VolumeError::NotReadable(problem.to_string()))
+            }
+        }
+    }
 }
 
 /// A request that was checked, with all that its frames need.
@@ -143,10 +154,11 @@ impl Plan {
     /// The field that can't be used, or there is no memory for the level.
     pub(crate) fn new(
         request: PathRequest,
-        (served, volume): (&ServedVolume, &Volume),
+        open: &OpenVolume,
         open_level: impl FnOnce(u32) -> Result<OpenVolume, VolumeError>,
         shares: &Shares,
     ) -> Result<Plan, SubmitError> {
+        let served = &*open.served;
         let asked = &served.info;
         request.quality.check()?;
         request.work.check()?;
@@ -159,7 +171,7 @@ impl Plan {
                 (**tf).clone()
             }
         };
-        let framing = framing(&request.path, volume, asked, &transfer, served.orientation)?;
+        let framing = framing_of(&request.path, &*open.source, &transfer, served.orientation)?;
         let request = Arc::new(request);
         // The request stays as it came: the same key has to mean the same request.
         let framed = framing.as_ref().map(|f| Box::new(request.path.framed(f)));
@@ -171,13 +183,10 @@ impl Plan {
         views.check(asked, |view| finest.see(view))?;
         let level = match request.level {
             LevelChoice::At(level) => level,
-            LevelChoice::Auto => finest.level(),
+            LevelChoice::Auto => finest.level_of(open.source.levels()),
         };
-        let info = &if level > asked.level {
-            open_level(level)?.served.info.clone()
-        } else {
-            asked.clone()
-        };
+        let drawn = if level > asked.level { open_level(level)? } else { open.clone() };
+        let info = &drawn.served.info;
         views.to_level = asked.lattice.to_centre_of(&info.lattice);
         if info.level != asked.level {
             views.check(info, |_| ())?;
@@ -194,6 +203,9 @@ impl Plan {
             BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), asked, &quality)?
                 .with_kept(request.work.keep)
                 .at_centre(views.to_level);
+        let wanted = window::fit(wanted, &drawn, shares, |each| {
+            (0..views.len()).try_for_each(|number| views.view(number, info).map(|view| each(&view)))
+        })?;
         let (volume, asked) = (info.clone(), asked.digest);
         Ok(Plan { request, wanted, transfer, quality, tween, views, framing, volume, asked })
     }

@@ -7,18 +7,18 @@
 use super::{
     Entries, Library, OpenVolume, ServedVolume, Viewer, VolumeError, no_such_digest, sample_bytes,
 };
-use slabcast_common::volume::{Digest32, Lattice, Volume};
+use slabcast_common::volume::{Digest32, Lattice};
 use slabcast_scene::request::VolumeChoice;
-use slabcast_volumes::blocks::{coarser, halved_lattice};
+use slabcast_volumes::blocks::{BlockSource, MemorySource, coarser, halved_lattice};
 use std::sync::{Arc, PoisonError};
 use tracing::info;
 
-/// A level of a volume, and its samples if they are in memory.
+/// A level that was computed from a volume, and its samples while they are in memory.
 pub(super) struct Level {
     /// Digest of the volume that it was computed from.
     of: Digest32,
     served: Arc<ServedVolume>,
-    samples: Option<Arc<Volume>>,
+    source: Option<Arc<dyn BlockSource>>,
     /// Value of the clock when it was used last.
     used: u64,
 }
@@ -29,12 +29,20 @@ fn lattices(lattice: &Lattice) -> impl Iterator<Item = Lattice> {
 }
 
 impl Library {
-    /// Returns a level of a volume with its samples; of a volume with fewer levels the coarsest, and of
-    /// one that is itself a coarser level its own.
+    /// Returns a level of a volume; of a volume with fewer levels the coarsest, and of one that is
+    /// itself a coarser level its own. A file's own levels are taken as they are; others are computed
+    /// from a volume in memory.
     ///
     /// # Errors
     /// There is no memory for it.
     pub fn level(&self, open: &OpenVolume, level: u32) -> Result<OpenVolume, VolumeError> {
+        let of_file = open.source.levels();
+        let Some(whole) = open.source.whole(open.level).filter(|_| of_file.len() == 1) else {
+            let found = of_file.iter().rposition(|info| info.level <= level);
+            let found = found.unwrap_or(0).max(open.level);
+            let ServedVolume { name, orientation, .. } = &*open.served;
+            return Ok(OpenVolume::of(open.source.clone(), found, name, *orientation));
+        };
         let info = &open.served.info;
         let steps = level.saturating_sub(info.level) as usize;
         let Some(lattice) = lattices(&info.lattice).take(steps + 1).last() else {
@@ -54,37 +62,38 @@ impl Library {
         }
         self.make_room(open, &lattice)?;
         // Each is halved from the next finer one, of which only the last is kept.
-        let mut fine = open.volume.clone();
-        while fine.lattice.dims != lattice.dims {
-            let Some(coarse) = coarser(&fine) else { break };
-            fine = Arc::new(coarse);
+        let mut coarse = coarser(whole);
+        while let Some(fine) = coarse.take_if(|fine| fine.lattice.dims != lattice.dims) {
+            coarse = coarser(&fine);
         }
-        let served = ServedVolume::new(&fine, open.served.orientation, fine.digest());
-        let coarse = OpenVolume { served: Arc::new(served), volume: fine };
+        let Some(coarse) = coarse else { return Ok(open.clone()) };
+        let source = Arc::new(MemorySource::of(coarse));
+        let ServedVolume { name, orientation, .. } = &*open.served;
+        let coarse = OpenVolume::of(source, 0, name, *orientation);
         let (name, dims) = (&open.served.name, lattice.dims);
         info!(volume = name, level, ?dims, digest = %coarse.served.info.digest, "level computed");
         self.lock().put_level(info.digest, &coarse);
         Ok(coarse)
     }
 
-    /// Returns the samples of a volume or level by digest; reads or computes them if they are not in
-    /// memory.
+    /// Returns a volume or level by digest; reads or computes it if it is not open.
     ///
     /// # Errors
-    /// They are gone, or can't be read.
-    pub(crate) fn samples(&self, digest: Digest32) -> Result<Arc<Volume>, VolumeError> {
+    /// It is gone, or can't be read.
+    pub(crate) fn open_level(&self, digest: Digest32) -> Result<OpenVolume, VolumeError> {
         let level = self.lock().level_of(digest);
         let Some((of, level)) = level else {
-            let open = self.open(&VolumeChoice::Digest(digest), Viewer::own())?;
-            return Ok(open.volume);
+            return self.open(&VolumeChoice::Digest(digest), Viewer::own());
         };
         let fine = self.open(&VolumeChoice::Digest(of), Viewer::own())?;
-        let open = self.level(&fine, level)?;
-        if open.served.info.digest == digest {
-            Ok(open.volume)
-        } else {
-            Err(no_such_digest(digest))
-        }
+        let open = match fine.source.levels().iter().position(|info| info.digest == digest) {
+            Some(found) => {
+                let ServedVolume { name, orientation, .. } = &*fine.served;
+                OpenVolume::of(fine.source.clone(), found, name, *orientation)
+            }
+            None => self.level(&fine, level)?,
+        };
+        if open.served.info.digest == digest { Ok(open) } else { Err(no_such_digest(digest)) }
     }
 
     /// Drops samples of others until there is memory for a level. What is halved on the way counts: at
@@ -124,7 +133,7 @@ impl Entries {
         let mut of_volume = self.levels.values_mut().filter(|level| level.of == of);
         let level = of_volume.find(|level| level.served.info.lattice == *lattice)?;
         level.used = self.clock;
-        Some(OpenVolume { served: level.served.clone(), volume: level.samples.clone()? })
+        Some(OpenVolume { served: level.served.clone(), source: level.source.clone()?, level: 0 })
     }
 
     fn put_level(&mut self, of: Digest32, open: &OpenVolume) {
@@ -134,7 +143,7 @@ impl Entries {
         let level = Level {
             of,
             served: open.served.clone(),
-            samples: Some(open.volume.clone()),
+            source: Some(open.source.clone()),
             used: self.clock,
         };
         self.levels.insert(open.served.info.digest, level);
@@ -142,25 +151,29 @@ impl Entries {
 
     /// Returns of which volume a digest is a level, and which level.
     fn level_of(&self, digest: Digest32) -> Option<(Digest32, u32)> {
-        self.levels.get(&digest).map(|level| (level.of, level.served.info.level))
+        if let Some(level) = self.levels.get(&digest) {
+            return Some((level.of, level.served.info.level));
+        }
+        let of_file = self.by_name.values().filter(|entry| entry.levels.contains(&digest));
+        of_file.filter_map(|entry| Some((entry.digest()?, 0))).find(|(of, _)| *of != digest)
     }
 
     /// Bytes of the samples of levels in memory.
     pub(super) fn level_bytes(&self) -> u64 {
-        let held = self.levels.values().filter(|level| level.samples.is_some());
+        let held = self.levels.values().filter(|level| level.source.is_some());
         held.map(|level| sample_bytes(&level.served.info)).sum()
     }
 
     /// When the level that was unused for longest was used; `None` if none is in memory.
     pub(super) fn oldest_level(&self) -> Option<(u64, Digest32)> {
-        let held = self.levels.iter().filter(|(_, level)| level.samples.is_some());
+        let held = self.levels.iter().filter(|(_, level)| level.source.is_some());
         held.map(|(digest, level)| (level.used, *digest)).min()
     }
 
     /// Drops the samples of a level.
     pub(super) fn drop_level(&mut self, digest: Digest32) {
         if let Some(level) = self.levels.get_mut(&digest) {
-            level.samples = None;
+            level.source = None;
         }
     }
 }

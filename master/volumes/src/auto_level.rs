@@ -30,6 +30,17 @@ impl<'a> AutoLevel<'a> {
         self.pixels = self.pixels.max(pixels);
     }
 
+    /// Returns the level among those that a file has, the finest first; of a volume with one level
+    /// [`AutoLevel::level`].
+    pub fn level_of(&self, levels: &[VolumeInfo]) -> u32 {
+        if levels.len() < 2 {
+            return self.level();
+        }
+        let vox = self.info.lattice.vox();
+        let fits = |level: &&VolumeInfo| self.pixels * (level.lattice.vox() / vox) <= AUTO_PIXELS;
+        levels.iter().rfind(fits).map_or(self.info.level, |level| level.level.max(self.info.level))
+    }
+
     /// Returns the level, at least that of the volume itself.
     pub fn level(&self) -> u32 {
         let (vox, mut lattice) = (self.info.lattice.vox(), self.info.lattice);

@@ -71,7 +71,7 @@ mod raw;
 mod samples;
 mod sketch;
 mod source;
-mod store;
+pub mod store;
 mod tiff_stack;
 mod units;
 mod unpack;

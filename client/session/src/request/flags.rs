@@ -122,7 +122,19 @@ impl AxisArgs {
     /// # Errors
     /// The axes are parallel.
     pub fn for_volume(&self, volume: &Volume) -> Result<Orientation, Fail> {
-        Orientation::for_volume(self.up, self.front, &volume.summary, volume.anatomical)
+        self.for_summary(&volume.summary)
+    }
+
+    /// Returns the axes of a volume without its samples, which must be told apart from each other.
+    ///
+    /// # Errors
+    /// Both flags name one axis.
+    pub fn for_info(&self, info: &VolumeInfo) -> Result<Orientation, Fail> {
+        self.for_summary(&info.summary)
+    }
+
+    fn for_summary(&self, summary: &ValueSummary) -> Result<Orientation, Fail> {
+        Orientation::for_volume(self.up, self.front, summary, summary.anatomical)
             .map_err(|e| Fail::flag(&e))
     }
 }

@@ -22,6 +22,15 @@ impl<V: Deref<Target = Volume>> MemorySource<V> {
     }
 }
 
+impl MemorySource {
+    /// Returns a source of a volume, whose digest it computes.
+    pub fn of(volume: impl Into<Arc<Volume>>) -> MemorySource {
+        let volume = volume.into();
+        let digest = volume.digest();
+        MemorySource::new(volume, digest)
+    }
+}
+
 impl<V: Deref<Target = Volume> + Send + Sync> BlockSource for MemorySource<V> {
     fn name(&self) -> &str {
         &self.volume.name
@@ -43,6 +52,11 @@ impl<V: Deref<Target = Volume> + Send + Sync> BlockSource for MemorySource<V> {
     fn summaries(&self, level: usize) -> Result<Arc<BlockSummaries>, Problem> {
         assert_eq!(level, 0, "a volume in memory has one level");
         Ok(self.summaries.get_or_init(|| Arc::new(summarise(&self.volume))).clone())
+    }
+
+    fn memory_bytes(&self) -> u64 {
+        let samples = &self.volume.samples;
+        (samples.len() * samples.kind().bytes()) as u64
     }
 
     fn whole(&self, level: usize) -> Option<&Volume> {

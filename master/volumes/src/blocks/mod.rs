@@ -54,6 +54,9 @@ pub trait BlockSource: Send + Sync {
     /// If there is no such level.
     fn summaries(&self, level: usize) -> Result<Arc<BlockSummaries>, Problem>;
 
+    /// Returns the bytes of memory that the source takes, or may come to take.
+    fn memory_bytes(&self) -> u64;
+
     /// Returns a level whose samples are all in memory; `None` of others.
     fn whole(&self, level: usize) -> Option<&Volume> {
         let _ = level;

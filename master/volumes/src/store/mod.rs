@@ -210,6 +210,11 @@ impl BrickStore {
         self.try_encoded(id).expect("samples in memory can be read")
     }
 
+    /// Returns the bytes of contents that are kept in memory at most.
+    pub fn kept_bytes(&self) -> u64 {
+        self.again.as_ref().map_or(self.bytes, |again| self.bytes.min(again.keep_bytes))
+    }
+
     /// Returns whether asking for a brick may read a file.
     pub fn may_read(&self) -> bool {
         self.again.as_ref().is_some_and(|again| self.bytes > again.keep_bytes)
@@ -368,6 +373,48 @@ fn cut_blocks(
     };
     (0..summaries.all.len()).into_par_iter().map(one).collect()
 }
+
+/// Size of a brick set, from what is known of blocks without their samples: an upper bound.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Estimate {
+    /// Number of blocks to read.
+    pub blocks: u64,
+    /// Number of bricks.
+    pub bricks: u64,
+    /// Bytes of the bricks, encoded.
+    pub bytes: u64,
+}
+
+/// Returns how large the set with these needs of a level may become.
+///
+/// # Errors
+/// A file can't be read, or is damaged.
+pub fn estimate(
+    source: &dyn BlockSource,
+    level: usize,
+    needs: &BrickNeeds,
+) -> Result<Estimate, Problem> {
+    let info = &source.levels()[level];
+    let summaries = source.summaries(level)?;
+    let same = SameBlocks::new(&summaries, needs, None);
+    let sample = if needs.coefficients { 4 } else { info.summary.kind.bytes() as u64 };
+    let voxel = sample + 2 * u64::from(needs.normals) + u64::from(needs.gradients);
+    let mut all = Estimate::default();
+    for block in (0..summaries.all.len()).filter(|&block| same.may_hold(block)) {
+        let lo = block_corner(summaries.dims, block);
+        let size: [u32; 3] =
+            std::array::from_fn(|a| (lo[a] + BLOCK_EDGE).min(info.lattice.dims[a]) - lo[a]);
+        let bricks: u64 = size.iter().map(|&n| u64::from(n.div_ceil(BRICK_EDGE))).product();
+        let voxels: u64 = size.iter().map(|&n| u64::from(n)).product();
+        all.blocks += 1;
+        all.bricks += bricks;
+        all.bytes += bricks * BRICK_HEAD_BYTES + voxels * voxel;
+    }
+    Ok(all)
+}
+
+/// Bytes of an encoded brick beside its voxels, at most: head, mask of voxels and checksum.
+const BRICK_HEAD_BYTES: u64 = 7 + 64 + 4;
 
 /// Cuts one block of a level; returns its bricks in ascending id.
 fn cut_block(

@@ -53,6 +53,7 @@ pub mod slab;
 pub mod spelling;
 pub mod stats;
 pub mod transfer;
+pub mod value_bins;
 pub mod view;
 pub mod volume;
 

@@ -11,6 +11,7 @@ use slabcast_common::block_set::BlockSet;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::quality::{Classify, InvalidField, Keep, Kernel, Quality};
 use slabcast_common::transfer::{Classifier, Support, TransferFunction};
+use slabcast_common::value_bins::ValueBins;
 use slabcast_common::volume::{Digest32, VolumeInfo};
 use std::sync::Arc;
 
@@ -56,7 +57,8 @@ impl BrickNeeds {
                 window: None,
             },
             Classify::After => BrickNeeds {
-                support: classifier.support().filled(&info.summary),
+                support: ValueBins::of(&info.summary)
+                    .rounded(&classifier.support().filled(&info.summary)),
                 normals: false,
                 gradients: false,
                 halo: HALO,

@@ -17,10 +17,11 @@ pub(crate) use memory::copy_box;
 
 use crate::error::Problem;
 use slabcast_common::transfer::Support;
-use slabcast_common::volume::{Samples, ValueSummary, Volume, VolumeInfo};
+use slabcast_common::volume::{Samples, Volume, VolumeInfo};
 use std::sync::Arc;
 
 pub use slabcast_common::block_set::{BLOCK_EDGE, block_dims};
+pub use slabcast_common::value_bins::ValueBins;
 
 /// A volume whose samples are read box by box.
 ///
@@ -82,43 +83,6 @@ pub struct BlockSummaries {
     pub bins: ValueBins,
     /// A summary for each block.
     pub all: Vec<BlockSummary>,
-}
-
-/// 64 bins of sample codes, in ascending order. What lies beyond the first or last edge is in the
-/// first or last bin.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ValueBins {
-    /// Code at which the first bin begins.
-    pub first_code: f64,
-    /// Width of a bin in codes; above zero.
-    pub width: f64,
-}
-
-impl ValueBins {
-    /// Returns bins over the values that nearly all samples have.
-    pub fn of(summary: &ValueSummary) -> ValueBins {
-        let (lo, hi) = match &summary.core {
-            Some(core) => (core.min_code, core.max_code),
-            None => (summary.min_code, summary.max_code),
-        };
-        let width = (hi - lo) / 64.0;
-        ValueBins { first_code: lo, width: if width > 0.0 { width } else { 1.0 } }
-    }
-
-    /// Returns the bin of a code that is not NaN, 0 to 63.
-    #[inline]
-    pub fn bin(&self, code: f64) -> u32 {
-        // The conversion saturates, at infinities too.
-        ((code - self.first_code) / self.width).clamp(0.0, 63.0) as u32
-    }
-
-    /// Returns the bins in which a support has codes.
-    pub fn mask(&self, support: &Support) -> u64 {
-        support.intervals.iter().fold(0, |mask, &(a, b)| {
-            let (first, last) = (self.bin(a), self.bin(b));
-            mask | (u64::MAX >> (63 - (last - first))) << first
-        })
-    }
 }
 
 impl BlockSummary {

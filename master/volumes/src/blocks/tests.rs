@@ -1,5 +1,5 @@
 use super::*;
-use slabcast_common::volume::{Lattice, ValueMap, Volume};
+use slabcast_common::volume::{Lattice, ValueMap, ValueSummary, Volume};
 
 fn support(intervals: &[(f64, f64)], nan: bool) -> Support {
     Support { intervals: intervals.to_vec(), nan }

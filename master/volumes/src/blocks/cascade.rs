@@ -15,7 +15,7 @@ use super::coding::Coding;
 use super::ome_zarr::LevelWriter;
 use super::planes::cut_bytes;
 use super::survey::{Counter, Survey, Surveyed};
-use super::{BLOCK_EDGE, ValueBins, halved, halved_lattice};
+use super::{BLOCK_EDGE, ValueBins, halved};
 use crate::error::{OpenErrorKind, Problem};
 use crate::samples::reserve;
 use slabcast_common::volume::{Lattice, Samples};
@@ -32,18 +32,6 @@ pub(crate) fn memory_bytes(lattice: &Lattice, coding: &Coding, levels: bool) -> 
     let halves = if levels { 3 * code } else { 2 * code } + 2 * number;
     let planes = nz.min(BLOCK_EDGE.into());
     nx.saturating_mul(ny).saturating_mul(planes * halves / 2).saturating_add(BESIDE_BYTES)
-}
-
-/// Returns the lattices of all levels that are written: up to one whose largest side is at most 64.
-pub(crate) fn lattices(lattice: &Lattice) -> Vec<Lattice> {
-    let mut levels = vec![*lattice];
-    while let Some(last) = levels.last()
-        && last.dims.iter().any(|&n| n > BLOCK_EDGE)
-        && let Some(next) = halved_lattice(last)
-    {
-        levels.push(next);
-    }
-    levels
 }
 
 /// One level on its way.

@@ -12,19 +12,29 @@
 mod cascade;
 #[cfg(feature = "zarr")]
 mod coding;
+mod formula;
 mod mean;
 mod memory;
 #[cfg(feature = "zarr")]
 pub mod ome_zarr;
 #[cfg(feature = "zarr")]
+mod open;
+#[cfg(feature = "zarr")]
 mod planes;
+#[cfg(feature = "zarr")]
+mod raw;
 #[cfg(feature = "zarr")]
 mod sidecar;
 #[cfg(feature = "zarr")]
 mod survey;
 
-pub use mean::{coarser, halved, halved_lattice};
+pub use formula::FormulaSource;
+pub use mean::{coarser, halved, halved_lattice, level_lattices};
 pub use memory::MemorySource;
+#[cfg(feature = "zarr")]
+pub use open::open_source;
+#[cfg(feature = "zarr")]
+pub use raw::RawSource;
 pub(crate) use memory::copy_box;
 
 use crate::error::Problem;

@@ -1,4 +1,3 @@
-use super::*;
 use slabcast_common::volume::{Samples, Volume};
 
 /// A PNG picture of `width` x `height` pixels from raw rows.

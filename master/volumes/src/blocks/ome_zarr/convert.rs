@@ -8,7 +8,7 @@ use crate::blocks::coding::{Coding, NumberRange};
 use crate::blocks::planes::Planes;
 use crate::blocks::sidecar::{Facts, LevelFacts};
 use crate::blocks::survey::{Counter, Surveyed, count_between};
-use crate::blocks::{BlockSource, ValueBins};
+use crate::blocks::{BlockSource, BlockSummaries, ValueBins, block_dims, level_lattices};
 use crate::error::{OpenError, OpenErrorKind, Problem};
 use crate::limit::free_memory;
 use crate::zarr::Own;
@@ -32,7 +32,8 @@ pub struct Converted {
 
 /// Reads a volume of any format and writes it as OME-Zarr at `to`, a folder that is made. Its samples
 /// keep type and value; each coarser level has means of two samples along each axis. Files whose samples
-/// lie in order are read slice by slice, whatever their size; others are read as a whole first.
+/// lie in order are read slice by slice, whatever their size; others are read as a whole first. With
+/// `replace`, a Zarr folder that is at `to` goes when the new one is whole.
 ///
 /// `on_progress` hears about each pass: one for integers of 8 and 16 bits, two for others, and more
 /// for floats with values far from all others.
@@ -44,12 +45,13 @@ pub fn convert(
     from: &Path,
     to: &Path,
     hints: &Hints,
+    replace: bool,
     on_progress: &mut OnProgress<'_>,
 ) -> Result<Converted, OpenError> {
     let named = |problem| OpenError { file: from.to_string_lossy().into_owned(), problem };
     let mut planes = Planes::open(from, hints).map_err(named)?;
     let notes = std::mem::take(&mut planes.notes);
-    let levels = write(&planes, to, on_progress).map_err(named)?;
+    let levels = write(&planes, to, replace, on_progress).map_err(named)?;
     Ok(Converted { levels, notes })
 }
 
@@ -57,19 +59,19 @@ pub fn convert(
 pub(crate) fn write(
     planes: &Planes,
     to: &Path,
+    replace: bool,
     on_progress: &mut OnProgress<'_>,
 ) -> Result<Vec<VolumeInfo>, Problem> {
-    let there = || {
-        Problem::new(
+    let is_free = || match to.symlink_metadata().is_ok() {
+        true if !replace || !crate::zarr::is_node(to) => Err(Problem::new(
             OpenErrorKind::Unreadable,
             "output",
             format!("{} is there already", to.display()),
             "give another name, or remove it",
-        )
+        )),
+        there => Ok(!there),
     };
-    if to.symlink_metadata().is_ok() {
-        return Err(there());
-    }
+    is_free()?;
     let parent = match to.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
@@ -84,9 +86,10 @@ pub(crate) fn write(
     ));
     let folder = builder.tempdir_in(parent).map_err(|e| written(parent, &e))?;
     let levels = fill(planes, folder.path(), &name, on_progress)?;
-    // Folders can't replace what is there, unless it is an empty one.
-    if to.symlink_metadata().is_ok() {
-        return Err(there());
+    if !is_free()? {
+        // Folders can't replace others; the old one goes out of the way, and then for good.
+        let old = builder.tempdir_in(parent).map_err(|e| written(parent, &e))?;
+        std::fs::rename(to, old.path().join("old")).map_err(|e| written(to, &e))?;
     }
     std::fs::rename(folder.path(), to).map_err(|e| written(to, &e))?;
     // It has another name now.
@@ -101,7 +104,7 @@ fn fill(
     name: &str,
     on_progress: &mut OnProgress<'_>,
 ) -> Result<Vec<VolumeInfo>, Problem> {
-    let lattices = cascade::lattices(&planes.lattice);
+    let lattices = level_lattices(&planes.lattice);
     let own = Own {
         file_type: planes.file_type.clone(),
         anatomical: planes.anatomical,
@@ -131,25 +134,15 @@ fn fill(
 
 /// Returns the levels as others know them.
 pub(crate) fn infos(lattices: &[Lattice], facts: &Facts) -> Vec<VolumeInfo> {
-    let digests = facts.levels.iter().map(|level| level.digest);
-    infos_of(lattices, digests, &facts.summary)
-}
-
-/// Returns levels with these digests; the summary is that of level 0.
-pub(crate) fn infos_of(
-    lattices: &[Lattice],
-    digests: impl Iterator<Item = Digest32>,
-    summary: &ValueSummary,
-) -> Vec<VolumeInfo> {
     let finest_vox = lattices[0].vox();
-    let info = |(level, (lattice, digest)): (u32, (&Lattice, Digest32))| VolumeInfo {
-        digest,
+    let info = |(level, (lattice, of)): (u32, (&Lattice, &LevelFacts))| VolumeInfo {
+        digest: of.digest,
         lattice: *lattice,
-        summary: summary.clone(),
+        summary: facts.summary.clone(),
         level,
         finest_vox,
     };
-    (0..).zip(lattices.iter().zip(digests)).map(info).collect()
+    (0..).zip(lattices.iter().zip(&facts.levels)).map(info).collect()
 }
 
 fn put(path: &Path, json: &serde_json::Value) -> Result<(), Problem> {
@@ -180,6 +173,21 @@ pub(crate) struct Unfinished {
     pub(crate) coding: Coding,
     pub(crate) summary: ValueSummary,
     pub(crate) digests: Vec<Digest32>,
+}
+
+impl Unfinished {
+    /// Returns the facts with blocks of which nothing is known yet.
+    pub(crate) fn blind(&self, lattices: &[Lattice]) -> Facts {
+        let bins = ValueBins::of(&self.summary);
+        let blocks = |lattice: &Lattice| {
+            Arc::new(BlockSummaries { dims: block_dims(lattice.dims), bins, all: Vec::new() })
+        };
+        let levels = self.digests.iter().zip(lattices);
+        let levels = levels
+            .map(|(&digest, lattice)| LevelFacts { digest, blocks: blocks(lattice) })
+            .collect();
+        Facts { coding: self.coding.clone(), summary: self.summary.clone(), levels }
+    }
 }
 
 /// Goes over the numbers of a volume: once for their range if codes depend on it, and once for all

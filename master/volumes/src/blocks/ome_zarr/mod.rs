@@ -6,7 +6,8 @@ mod source;
 mod write;
 
 pub use convert::{Converted, OnProgress, convert};
-pub use source::OmeZarrSource;
+pub(crate) use convert::{blocks_again, infos, walk};
+pub use source::{OmeZarrSource, level_sizes};
 pub(crate) use write::{LevelWriter, packed};
 
 /// Sidecar in the folder of a pyramid that we wrote. It is in an array's folder, whose other files no

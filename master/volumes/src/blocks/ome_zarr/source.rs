@@ -1,6 +1,6 @@
 //! An OME-Zarr pyramid or a Zarr array as a source of boxes.
 
-use super::convert::{Unfinished, blocks_again, facts, guess, infos, infos_of};
+use super::convert::{Unfinished, blocks_again, facts, guess, infos};
 use super::{OnProgress, SIDECAR};
 use crate::Hints;
 use crate::blocks::coding::{Coding, NumberRange};
@@ -185,6 +185,20 @@ impl Opening {
     }
 }
 
+/// Returns samples and spacing along x, y and z of each level of the pyramid in a folder; `None` for
+/// anything else. Reads metadata alone.
+pub fn level_sizes(folder: &Path) -> Option<Vec<([u64; 3], [f64; 3])>> {
+    if !folder.is_dir() || !crate::zarr::is_node(folder) {
+        return None;
+    }
+    let picture = Picture::open(folder).ok()?;
+    let size = |level| {
+        let (_, placed) = picture.level(level, &crate::Pick::default()).ok()?;
+        Some((placed.dims, placed.lattice.spacing()))
+    };
+    (0..picture.levels()).map(size).collect()
+}
+
 /// Checks that a level has chunks in a number and size that can be read one by one.
 fn check_chunks(reader: &LevelReader) -> Result<(), Problem> {
     reader.array().check_counts(reader.placed())
@@ -204,16 +218,8 @@ pub(super) fn identity_inside(folder: &Path) -> Result<Identity, Problem> {
 /// Looks again at the blocks of a pyramid, of which all else is known.
 pub(super) fn complete(folder: &Path, unfinished: Unfinished) -> Result<Facts, Problem> {
     let opening = Opening::new(folder, &Hints::default())?;
-    // Without blocks as yet.
-    let facts = Facts {
-        coding: unfinished.coding.clone(),
-        summary: unfinished.summary.clone(),
-        levels: Vec::new(),
-    };
-    let digests = unfinished.digests.iter().copied();
-    let levels = infos_of(&opening.lattices, digests, &facts.summary);
-    let mut source = OmeZarrSource::with_facts(opening, &facts);
-    source.levels = levels;
+    let blind = unfinished.blind(&opening.lattices);
+    let source = OmeZarrSource::with_facts(opening, &blind);
     blocks_again(&source, unfinished)
 }
 

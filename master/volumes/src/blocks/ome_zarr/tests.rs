@@ -2,7 +2,7 @@ use super::*;
 use crate::blocks::{BlockSource, ValueBins, halved, halved_lattice};
 use crate::error::Problem;
 use crate::{Hints, open};
-use slabcast_common::volume::{Lattice, Samples, Volume};
+use slabcast_common::volume::{Samples, Volume};
 use std::path::{Path, PathBuf};
 
 fn silent(_: u64, _: u64) -> Result<(), Problem> {
@@ -74,7 +74,7 @@ fn all_types_come_back_with_digest_summary_blocks_and_means() {
     for (name, bytes) in files() {
         let from = put(folder.path(), &name, &bytes);
         let to = folder.path().join(format!("{name}.ome.zarr"));
-        let converted = convert(&from, &to, &Hints::default(), &mut silent);
+        let converted = convert(&from, &to, &Hints::default(), false, &mut silent);
         let converted = converted.unwrap_or_else(|e| panic!("{name}: {e}"));
         let volume = open(&from).expect("the raw file");
         let source = opened(&to);

@@ -6,6 +6,7 @@ use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
+use std::convert::Infallible;
 
 /// Lattice of a volume's samples. World units are the file's (mm), world axes anatomical (RAS+)
 /// where the file has them (docs/design/contracts.md, World and camera).
@@ -426,8 +427,65 @@ impl ValueSummary {
                 }
             }
         }
-        s.core = core::find(samples, &s);
+        let count = |lo, hi| Ok::<_, Infallible>(core::counted(samples, lo, hi));
+        s.core = core::find(&s, count).unwrap_or_else(|e| match e {});
         s
+    }
+
+    /// Returns the summary of samples of 8 or 16 bits that were counted: `counts[c]` is the number of
+    /// samples of code c. It equals [`ValueSummary::from_samples`] of the same samples.
+    ///
+    /// # Panics
+    /// If there are not 256 counts for 8 bits, or 65536 for 16.
+    pub fn from_code_counts(kind: SampleKind, counts: &[u64], map: ValueMap) -> Self {
+        assert_eq!(counts.len(), 1 << (8 * kind.bytes().min(2)), "one count for each code");
+        let first = counts.iter().position(|&n| n > 0).unwrap_or(0);
+        let last = counts.iter().rposition(|&n| n > 0).unwrap_or(0);
+        let present = || (first..=last).map(|c| (c as f64, counts[c])).filter(|(_, n)| *n > 0);
+        let mut s = ValueSummary {
+            kind,
+            map,
+            min_code: first as f64,
+            max_code: last as f64,
+            histogram: vec![0; 256],
+            nan: 0,
+            infinite: 0,
+            anatomical: false,
+            core: None,
+        };
+        for (code, n) in present() {
+            let bin = s.bin(code);
+            s.histogram[bin] += n;
+        }
+        let count = |lo, hi| {
+            let mut histogram = vec![0; 256];
+            present().for_each(|(code, n)| histogram[core::bin(code, lo, hi)] += n);
+            Ok::<_, Infallible>(histogram)
+        };
+        s.core = core::find(&s, count).unwrap_or_else(|e| match e {});
+        s
+    }
+
+    /// Finds the core of samples that do not lie in memory, and whose range, histogram and counts are
+    /// known. `count` counts the finite samples between two codes, each in the bin of
+    /// [`ValueSummary::core_bin`]; it is called only if ends of the range hold next to nothing, up to 41
+    /// times. The summary then equals [`ValueSummary::from_samples`] of the same samples.
+    ///
+    /// # Errors
+    /// Those of `count`.
+    pub fn find_core<E>(
+        &mut self,
+        count: impl FnMut(f64, f64) -> Result<Vec<u64>, E>,
+    ) -> Result<(), E> {
+        self.core = core::find(self, count)?;
+        Ok(())
+    }
+
+    /// Returns the bin, 0 to 255, of a finite code in a count between two codes; what lies beyond is in
+    /// the first or the last.
+    #[inline]
+    pub fn core_bin(code: f64, lo: f64, hi: f64) -> usize {
+        core::bin(code, lo, hi)
     }
 
     /// Returns the histogram bin of a finite code, 0 to 255.

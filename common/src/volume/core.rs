@@ -6,7 +6,7 @@
 //! in bins of its own, until little more can be cut. Volumes without such ends, nearly all, have no
 //! core: their range will do.
 
-use super::{Samples, ValueCore, ValueSummary};
+use super::{SampleKind, Samples, ValueCore, ValueSummary};
 
 /// Share of the samples that may lie beyond either end: 170 of a scan of 256^3. Fillings of teeth
 /// are ten times as many.
@@ -27,9 +27,14 @@ const ROUNDS: usize = 40;
 const ROOM: f64 = 0.1;
 
 /// Finds the core of samples whose range and histogram are `s`; `None` if there is no need of one.
-pub(super) fn find(samples: &Samples, s: &ValueSummary) -> Option<ValueCore> {
-    if matches!(samples, Samples::U8(_)) {
-        return None;
+/// `count` counts the finite samples between two codes ([`bin`]); it is called for ends that hold next
+/// to nothing alone.
+pub(super) fn find<E>(
+    s: &ValueSummary,
+    mut count: impl FnMut(f64, f64) -> Result<Vec<u64>, E>,
+) -> Result<Option<ValueCore>, E> {
+    if s.kind == SampleKind::U8 {
+        return Ok(None);
     }
     let padded = s.map.scale > 0.0;
     let (mut lo, mut hi) = (s.min_code, s.max_code);
@@ -46,16 +51,16 @@ pub(super) fn find(samples: &Samples, s: &ValueSummary) -> Option<ValueCore> {
         }
         cut_below |= first > 0;
         (lo, hi) = (a, b);
-        histogram = counted(samples, lo, hi);
+        histogram = count(lo, hi)?;
     }
     if hi - lo > NARROW * (s.max_code - s.min_code) {
-        return None;
+        return Ok(None);
     }
     if cut_below {
         lo = (lo - ROOM * (hi - lo)).max(s.min_code);
-        histogram = counted(samples, lo, hi);
+        histogram = count(lo, hi)?;
     }
-    (hi > lo).then_some(ValueCore { min_code: lo, max_code: hi, histogram })
+    Ok((hi > lo).then_some(ValueCore { min_code: lo, max_code: hi, histogram }))
 }
 
 /// Returns the first and the last bin that hold more than a few samples, the bin of padding left
@@ -79,12 +84,17 @@ fn trimmed(histogram: &[u64], negative: bool) -> (usize, usize) {
     (first, last)
 }
 
-fn counted(samples: &Samples, lo: f64, hi: f64) -> Vec<u64> {
-    let mut histogram = vec![0; 256];
+/// Returns the bin, 0 to 255, of a finite code in a count between two codes; what lies beyond is in
+/// the first or the last.
+#[inline]
+pub(super) fn bin(code: f64, lo: f64, hi: f64) -> usize {
     let scale = 256.0 / (hi - lo);
-    let mut count = |code: f64| {
-        histogram[(((code - lo) * scale).max(0.0) as usize).min(255)] += 1;
-    };
+    (((code - lo) * scale).max(0.0) as usize).min(255)
+}
+
+pub(super) fn counted(samples: &Samples, lo: f64, hi: f64) -> Vec<u64> {
+    let mut histogram = vec![0; 256];
+    let mut count = |code: f64| histogram[bin(code, lo, hi)] += 1;
     match samples {
         Samples::U8(v) => v.iter().for_each(|&c| count(f64::from(c))),
         Samples::U16(v) => v.iter().for_each(|&c| count(f64::from(c))),

@@ -72,6 +72,7 @@ mod samples;
 mod sketch;
 mod source;
 pub mod store;
+mod stream;
 mod tiff_stack;
 mod units;
 mod unpack;

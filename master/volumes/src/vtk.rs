@@ -157,7 +157,7 @@ pub(crate) fn read(
             samples::read(&mut file.inner.take(layout.bytes()), supply, &layout, cap)?
         }
     };
-    Ok(Volume::new(name, number.name(), false, lattice, samples, map))
+    Ok(crate::stream::volume(name, number.name(), false, lattice, samples, map))
 }
 
 fn bad(field: &str, what: impl Into<String>) -> Problem {

@@ -6,6 +6,7 @@
 //! others are as thick. Where a side has an odd number of samples, the last mean is over those there
 //! are.
 
+use super::BLOCK_EDGE;
 use rayon::prelude::*;
 use slabcast_common::volume::{CoarseLevel, Lattice, Samples, Volume};
 
@@ -24,6 +25,19 @@ pub fn halved_lattice(lattice: &Lattice) -> Option<Lattice> {
         }
     }
     Some(coarse)
+}
+
+/// Returns the lattices of all levels of a pyramid, up to one whose largest side is at most a block's
+/// edge, or that can't be halved.
+pub fn level_lattices(lattice: &Lattice) -> Vec<Lattice> {
+    let mut levels = vec![*lattice];
+    while let Some(last) = levels.last()
+        && last.dims.iter().any(|&n| n > BLOCK_EDGE)
+        && let Some(next) = halved_lattice(last)
+    {
+        levels.push(next);
+    }
+    levels
 }
 
 fn halved_axes(lattice: &Lattice) -> [bool; 3] {

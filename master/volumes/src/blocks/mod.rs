@@ -8,11 +8,33 @@
 //! Blocks of [`BLOCK_EDGE`] samples an edge are the unit of summaries: what values a block holds is
 //! known without its samples, so that blocks a transfer function does not show are never read.
 
+#[cfg(feature = "zarr")]
+mod cascade;
+#[cfg(feature = "zarr")]
+mod coding;
+mod formula;
 mod mean;
 mod memory;
+#[cfg(feature = "zarr")]
+pub mod ome_zarr;
+#[cfg(feature = "zarr")]
+mod open;
+#[cfg(feature = "zarr")]
+mod planes;
+#[cfg(feature = "zarr")]
+mod raw;
+#[cfg(feature = "zarr")]
+mod sidecar;
+#[cfg(feature = "zarr")]
+mod survey;
 
-pub use mean::{coarser, halved, halved_lattice};
+pub use formula::FormulaSource;
+pub use mean::{coarser, halved, halved_lattice, level_lattices};
 pub use memory::MemorySource;
+#[cfg(feature = "zarr")]
+pub use open::open_source;
+#[cfg(feature = "zarr")]
+pub use raw::RawSource;
 pub(crate) use memory::copy_box;
 
 use crate::error::Problem;
@@ -85,6 +107,13 @@ pub struct BlockSummaries {
     pub all: Vec<BlockSummary>,
 }
 
+impl BlockSummaries {
+    /// Returns the bytes that the summaries take in memory.
+    pub fn memory_bytes(&self) -> u64 {
+        (self.all.len() * size_of::<BlockSummary>()) as u64
+    }
+}
+
 impl BlockSummary {
     /// Returns the summary of samples.
     pub fn of(samples: &Samples, bins: &ValueBins) -> BlockSummary {
@@ -111,6 +140,28 @@ impl BlockSummary {
     pub fn meets(&self, mask: u64, support: &Support) -> bool {
         self.bins & mask != 0 || (self.nan && support.nan)
     }
+}
+
+/// Returns the summaries of a level's blocks, each of which is read.
+#[cfg(feature = "zarr")]
+pub(crate) fn summaries_of(
+    source: &dyn BlockSource,
+    level: usize,
+    bins: ValueBins,
+) -> Result<BlockSummaries, Problem> {
+    use rayon::prelude::*;
+    let size = source.levels()[level].lattice.dims;
+    let dims = block_dims(size);
+    let count: usize = dims.iter().map(|&n| n as usize).product();
+    let of = |i: usize| {
+        let [nx, ny, _] = dims.map(|n| n as usize);
+        let at = [(i % nx) as u32, (i / nx % ny) as u32, (i / nx / ny) as u32];
+        let lo = at.map(|n| n * BLOCK_EDGE);
+        let hi = std::array::from_fn(|a| (lo[a] + BLOCK_EDGE).min(size[a]));
+        Ok(BlockSummary::of(&source.read_box(level, lo, hi)?, &bins))
+    };
+    let all: Result<Vec<BlockSummary>, Problem> = (0..count).into_par_iter().map(of).collect();
+    Ok(BlockSummaries { dims, bins, all: all? })
 }
 
 #[cfg(test)]

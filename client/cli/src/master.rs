@@ -8,12 +8,13 @@ use crate::systemd::{self, DRAIN};
 use slabcast_master::library::{ReadFile, Source, Unreadable, UploadConfig, Viewer};
 use slabcast_master::memory::{Shares, available};
 use slabcast_master::{Library, LibraryConfig, MasterConfig, PeerLimits};
-use slabcast_scene::path::{Axis, Orientation};
+use slabcast_scene::path::Axis;
 use slabcast_session::embedded::start_master;
 use slabcast_session::fail::{Fail, reason, say};
 use slabcast_session::machine::boot_id;
 use slabcast_session::progress::bytes;
 use slabcast_session::request::AxisArgs;
+use slabcast_session::volume::OpenedSource;
 use slabcast_session::{parse, record, runtime, signals, volume};
 use slabcast_volumes::{OpenError, OpenErrorKind};
 use std::net::SocketAddr;
@@ -133,9 +134,9 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
     let port = address.map_or(0, |address| address.port());
     let given = match &args.volume {
         Some(path) => {
-            let source = args.input.open_source(path)?;
-            let orientation = axes.for_info(&source.levels()[0])?;
-            Some((source, orientation))
+            let opened = args.input.open_source(path)?;
+            let orientation = axes.for_info(opened.info())?;
+            Some((opened.source, orientation))
         }
         None => None,
     };
@@ -249,7 +250,7 @@ fn library(args: &MasterArgs, given: Option<Source>, port: u16) -> Result<Librar
         let opened = input.read(path, most_bytes);
         // Clients are told the file's name, not its folder.
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let (source, notes) = opened.map_err(|e| {
+        let (OpenedSource { source, .. }, notes) = opened.map_err(|e| {
             let is_too_large = e.problem.kind == OpenErrorKind::TooLarge;
             Unreadable { reason: OpenError { file: name, ..e }.to_string(), is_too_large }
         })?;

@@ -14,7 +14,7 @@ use slabcast_common::image::Background;
 use slabcast_common::quality::{
     Borders, Classify, Compositing, Kernel, Quality, Schedule, Splat, Sums, Work,
 };
-use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_common::volume::{ValueSummary, Volume, VolumeInfo};
 use slabcast_scene::path::{
     Axis, Crop, Fit, Key, KeyFrames, Orientation, ProjectionKind, Side, Turntable, ViewPath,
 };

@@ -134,10 +134,8 @@ impl<'a> Cascade<'a> {
         let codes_seen: &Samples = codes;
         let own_seen: &[u8] = own;
         let z = *done / BLOCK_EDGE;
-        let halve = || {
-            (!next.is_empty())
-                .then(|| coding.as_stored(halved(lattice, dims, codes_seen)))
-        };
+        let halve =
+            || (!next.is_empty()).then(|| coding.as_stored(halved(lattice, dims, codes_seen)));
         let look = || match writer {
             None => survey.slab(codes_seen, |_, _, _| (), |_, _| Ok(())),
             Some(writer) => {

@@ -96,12 +96,8 @@ impl NumberRange {
         match self {
             NumberRange::Integers { min, max } => {
                 macro_rules! widen {
-                    (f32) => {
-                        {}
-                    };
-                    (f64) => {
-                        {}
-                    };
+                    (f32) => {{}};
+                    (f64) => {{}};
                     ($t:ty) => {
                         if let (Some(lo), Some(hi)) =
                             (numbers!($t, bytes).min(), numbers!($t, bytes).max())
@@ -268,12 +264,8 @@ impl Coding {
             (Form::Integers { min, max }, Samples::U16(to)) => {
                 // Levels of other programs may go beyond the range of the first.
                 macro_rules! extend {
-                    (f32) => {
-                        {}
-                    };
-                    (f64) => {
-                        {}
-                    };
+                    (f32) => {{}};
+                    (f64) => {{}};
                     ($t:ty) => {
                         to.extend(
                             numbers!($t, bytes)
@@ -285,12 +277,8 @@ impl Coding {
             }
             (Form::Integers { min, max }, Samples::F32(to)) => {
                 macro_rules! extend {
-                    (f32) => {
-                        {}
-                    };
-                    (f64) => {
-                        {}
-                    };
+                    (f32) => {{}};
+                    (f64) => {{}};
                     ($t:ty) => {
                         to.extend(numbers!($t, bytes).map(|v| {
                             wide::unit_code(i128::from(v).clamp(min, max), min, max - min)

@@ -31,11 +31,11 @@ mod survey;
 pub use formula::FormulaSource;
 pub use mean::{coarser, halved, halved_lattice, level_lattices};
 pub use memory::MemorySource;
+pub(crate) use memory::copy_box;
 #[cfg(feature = "zarr")]
-pub use open::open_source;
+pub use open::{is_large, open_source};
 #[cfg(feature = "zarr")]
 pub use raw::RawSource;
-pub(crate) use memory::copy_box;
 
 use crate::error::Problem;
 use slabcast_common::transfer::Support;

@@ -29,6 +29,22 @@ pub fn open_source(
         .map_err(|problem| OpenError { file: shown.clone().into_owned(), problem })
 }
 
+/// Bytes of samples from which a Zarr picture is read by blocks rather than as a whole.
+const LARGE_BYTES: u64 = 256 << 20;
+
+/// Returns whether a volume is better read by blocks ([`open_source`]) than as a whole: a Zarr picture
+/// with a finest level of more than 256 MiB, or a formula for tests of size.
+pub fn is_large(path: &Path, hints: &Hints) -> bool {
+    if path.to_string_lossy().starts_with(FormulaSource::PREFIX) {
+        return true;
+    }
+    if !path.is_dir() || !crate::zarr::is_node(path) {
+        return false;
+    }
+    let finest = crate::zarr::Picture::open(path).and_then(|p| p.level(0, &hints.pick));
+    finest.is_ok_and(|(array, placed)| placed.bytes(&array) > LARGE_BYTES)
+}
+
 fn open(
     path: &Path,
     shown: &str,

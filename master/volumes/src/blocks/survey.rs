@@ -60,9 +60,7 @@ impl Counter {
         recount: impl FnMut(f64, f64) -> Result<Vec<u64>, Problem>,
     ) -> Result<ValueSummary, Problem> {
         let summary = match self {
-            Counter::Codes { kind, counts } => {
-                ValueSummary::from_code_counts(kind, &counts, map)
-            }
+            Counter::Codes { kind, counts } => ValueSummary::from_code_counts(kind, &counts, map),
             Counter::Floats { mut summary } => {
                 summary.find_core(recount)?;
                 summary

@@ -84,7 +84,8 @@ pub(crate) fn run(args: &InfoArgs) -> Result<(), Fail> {
     if args.json {
         let mut json = json(&volume, &info, orientation, &shares);
         if !levels.is_empty() {
-            json["levels"] = levels.iter().map(|l| serde_json::json!({"dims": l.0, "spacing": l.1})).collect();
+            json["levels"] =
+                levels.iter().map(|l| serde_json::json!({"dims": l.0, "spacing": l.1})).collect();
         }
         return say(&format!("{json:#}\n"));
     }
@@ -93,7 +94,11 @@ pub(crate) fn run(args: &InfoArgs) -> Result<(), Fail> {
         let [nx, ny, nz] = dims;
         let name = if i == 0 { "levels" } else { "" };
         // Writing to a string does not fail.
-        let _ = writeln!(text, "{name:<12} {i}: {nx} x {ny} x {nz}, spacing {}", triple(*spacing, " x "));
+        let _ = writeln!(
+            text,
+            "{name:<12} {i}: {nx} x {ny} x {nz}, spacing {}",
+            triple(*spacing, " x ")
+        );
     }
     say(&text)
 }

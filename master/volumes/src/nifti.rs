@@ -383,7 +383,8 @@ impl Header {
         if let Some(rescale) = self.rescale() {
             beside.rescale(rescale);
         }
-        let volume = crate::stream::volume(name, layout.number.name(), anatomical, lattice, samples, map);
+        let volume =
+            crate::stream::volume(name, layout.number.name(), anatomical, lattice, samples, map);
         let (lo, hi) = volume.summary.range();
         if !(lo.is_finite() && hi.is_finite() && map.scale.is_normal()) {
             return Err(Problem::malformed(

@@ -134,17 +134,15 @@ impl<'a> Cascade<'a> {
         let codes_seen: &Samples = codes;
         let own_seen: &[u8] = own;
         let z = *done / BLOCK_EDGE;
-        let halve = || {
-            (!next.is_empty())
-                .then(|| coding.as_stored(halved(lattice, dims, codes_seen)))
-        };
+        let halve =
+            || (!next.is_empty()).then(|| coding.as_stored(halved(lattice, dims, codes_seen)));
         let look = || match writer {
             None => survey.slab(codes_seen, |_, _, _| (), |_, _| Ok(())),
             Some(writer) => {
                 let shape = writer.chunk_shape();
-                let pack = |lo: [u32; 3], hi: [u32; 3], part: &Samples| {
+                let pack = |lo: [u32; 3], hi: [u32; 3], part: Samples| {
                     let numbers = match own_seen.is_empty() {
-                        true => coding.numbers(part),
+                        true => coding.into_numbers(part),
                         false => cut_bytes(own_seen, size, dims, lo, hi),
                     };
                     let box_dims = std::array::from_fn(|a| hi[a] - lo[a]);

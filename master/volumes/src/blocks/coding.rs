@@ -96,12 +96,8 @@ impl NumberRange {
         match self {
             NumberRange::Integers { min, max } => {
                 macro_rules! widen {
-                    (f32) => {
-                        {}
-                    };
-                    (f64) => {
-                        {}
-                    };
+                    (f32) => {{}};
+                    (f64) => {{}};
                     ($t:ty) => {
                         if let (Some(lo), Some(hi)) =
                             (numbers!($t, bytes).min(), numbers!($t, bytes).max())
@@ -163,6 +159,13 @@ impl NumberRange {
             }
         }
     }
+}
+
+/// Returns the bytes of all items.
+fn words<T: Copy, const SIZE: usize>(items: &[T], bytes: impl Fn(T) -> [u8; SIZE]) -> Vec<u8> {
+    let mut all = vec![0; items.len() * SIZE];
+    all.chunks_exact_mut(SIZE).zip(items).for_each(|(to, &item)| to.copy_from_slice(&bytes(item)));
+    all
 }
 
 impl Coding {
@@ -268,12 +271,8 @@ impl Coding {
             (Form::Integers { min, max }, Samples::U16(to)) => {
                 // Levels of other programs may go beyond the range of the first.
                 macro_rules! extend {
-                    (f32) => {
-                        {}
-                    };
-                    (f64) => {
-                        {}
-                    };
+                    (f32) => {{}};
+                    (f64) => {{}};
                     ($t:ty) => {
                         to.extend(
                             numbers!($t, bytes)
@@ -285,12 +284,8 @@ impl Coding {
             }
             (Form::Integers { min, max }, Samples::F32(to)) => {
                 macro_rules! extend {
-                    (f32) => {
-                        {}
-                    };
-                    (f64) => {
-                        {}
-                    };
+                    (f32) => {{}};
+                    (f64) => {{}};
                     ($t:ty) => {
                         to.extend(numbers!($t, bytes).map(|v| {
                             wide::unit_code(i128::from(v).clamp(min, max), min, max - min)
@@ -317,10 +312,9 @@ impl Coding {
         match (self.form, codes) {
             (Form::Same, Samples::U8(v)) => v.clone(),
             (Form::Flipped, Samples::U8(v)) => v.iter().map(|c| c ^ 0x80).collect(),
-            (Form::Same | Form::Floats { .. }, codes) => codes.le_bytes(0..codes.len()).into(),
-            (Form::Flipped, Samples::U16(v)) => {
-                v.iter().flat_map(|c| (c ^ 0x8000).to_le_bytes()).collect()
-            }
+            (Form::Same, Samples::U16(v)) => words(v, u16::to_le_bytes),
+            (Form::Flipped, Samples::U16(v)) => words(v, |c| (c ^ 0x8000).to_le_bytes()),
+            (Form::Floats { .. }, Samples::F32(v)) => words(v, f32::to_le_bytes),
             (Form::Integers { min, .. }, Samples::U16(v)) => {
                 macro_rules! collect {
                     (f32) => {
@@ -360,6 +354,14 @@ impl Coding {
                 v.iter().flat_map(|&c| map.value(c.into()).to_le_bytes()).collect()
             }
             _ => panic!("codes of the coding's type"),
+        }
+    }
+
+    /// Returns the numbers of codes like [`Coding::numbers`], without a copy where they are the same.
+    pub(crate) fn into_numbers(&self, codes: Samples) -> Vec<u8> {
+        match (self.form, codes) {
+            (Form::Same, Samples::U8(v)) => v,
+            (_, codes) => self.numbers(&codes),
         }
     }
 

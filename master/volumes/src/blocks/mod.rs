@@ -31,11 +31,11 @@ mod survey;
 pub use formula::FormulaSource;
 pub use mean::{coarser, halved, halved_lattice, level_lattices};
 pub use memory::MemorySource;
+pub(crate) use memory::copy_box;
 #[cfg(feature = "zarr")]
 pub use open::open_source;
 #[cfg(feature = "zarr")]
 pub use raw::RawSource;
-pub(crate) use memory::copy_box;
 
 use crate::error::Problem;
 use slabcast_common::transfer::Support;
@@ -164,5 +164,7 @@ pub(crate) fn summaries_of(
     Ok(BlockSummaries { dims, bins, all: all? })
 }
 
+#[cfg(test)]
+mod large_tests;
 #[cfg(test)]
 mod tests;

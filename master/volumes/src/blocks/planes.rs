@@ -165,8 +165,7 @@ impl Planes {
                     .unwrap_or_else(|panic| Err(Problem::panicked("data", &*panic)))
             };
             let builder = std::thread::Builder::new().name("slabcast-read".into());
-            let reader =
-                builder.spawn_scoped(scope, open).map_err(|e| Problem::io("data", &e))?;
+            let reader = builder.spawn_scoped(scope, open).map_err(|e| Problem::io("data", &e))?;
             let size = self.number.bytes() as usize;
             let mut received = 0;
             while let Ok(mut chunk) = chunks.from.recv() {
@@ -258,4 +257,3 @@ pub(crate) fn cut_bytes(
     }
     to
 }
-

@@ -60,9 +60,9 @@ impl Facts {
         let mut builder = tempfile::Builder::new();
         builder.prefix(".slabcast-");
         #[cfg(unix)]
-        builder.permissions(<std::fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(
-            0o666,
-        ));
+        builder.permissions(
+            <std::fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666),
+        );
         let file = builder.tempfile_in(folder)?;
         let to = std::io::BufWriter::new(file.as_file().try_clone()?);
         let mut out = HashWriter { to, hash: Sha256::new() };

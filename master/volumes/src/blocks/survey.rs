@@ -60,9 +60,7 @@ impl Counter {
         recount: impl FnMut(f64, f64) -> Result<Vec<u64>, Problem>,
     ) -> Result<ValueSummary, Problem> {
         let summary = match self {
-            Counter::Codes { kind, counts } => {
-                ValueSummary::from_code_counts(kind, &counts, map)
-            }
+            Counter::Codes { kind, counts } => ValueSummary::from_code_counts(kind, &counts, map),
             Counter::Floats { mut summary } => {
                 summary.find_core(recount)?;
                 summary
@@ -152,7 +150,7 @@ impl Survey {
     pub(crate) fn slab<T: Send>(
         &mut self,
         codes: &Samples,
-        beside: impl Fn([u32; 3], [u32; 3], &Samples) -> T + Sync,
+        beside: impl Fn([u32; 3], [u32; 3], Samples) -> T + Sync,
         mut take: impl FnMut([u32; 2], Vec<T>) -> Result<(), Problem> + Send,
     ) -> Result<(), Problem> {
         let [nx, ny, _] = self.lattice.dims;
@@ -165,7 +163,7 @@ impl Survey {
             let hi = std::array::from_fn(|a| (lo[a] + BLOCK_EDGE).min(dims[a]));
             let part = copy_box(codes, dims, lo, hi);
             let held = held(&part, guess, counter.as_ref(), scratch);
-            (held, beside(lo, hi, &part))
+            (held, beside(lo, hi, part))
         };
         let mut all: Vec<Option<Held>> = Vec::new();
         all.resize_with(grid[0] as usize * grid[1] as usize, || None);

@@ -72,11 +72,7 @@ impl Own {
             file_type: own.required("file_type")?.text()?.chars().take(60).collect(),
             anatomical: own.required("anatomical")?.value == true,
             rescale,
-            steps: [
-                vector(&steps.entry(0))?,
-                vector(&steps.entry(1))?,
-                vector(&steps.entry(2))?,
-            ],
+            steps: [vector(&steps.entry(0))?, vector(&steps.entry(1))?, vector(&steps.entry(2))?],
             origin: vector(&own.required("origin")?)?,
         }))
     }

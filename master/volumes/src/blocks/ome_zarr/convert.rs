@@ -81,9 +81,8 @@ pub(crate) fn write(
     let prefix = format!(".{name}.");
     builder.prefix(&prefix).suffix(".tmp");
     #[cfg(unix)]
-    builder.permissions(<std::fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(
-        0o777,
-    ));
+    builder
+        .permissions(<std::fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o777));
     let folder = builder.tempdir_in(parent).map_err(|e| written(parent, &e))?;
     let levels = fill(planes, folder.path(), &name, on_progress)?;
     if !is_free()? {
@@ -220,7 +219,9 @@ pub(crate) fn walk(
     })?;
     let found = cascade.finish()?;
     let recount = |lo, hi| recount(planes, &coding, (lo, hi), on_progress);
-    Ok(Walked { facts: facts(coding.clone(), (planes.anatomical, lattices[0].vox()), found, recount)? })
+    Ok(Walked {
+        facts: facts(coding.clone(), (planes.anatomical, lattices[0].vox()), found, recount)?,
+    })
 }
 
 /// Returns the range of all numbers; `None` for types whose codes do not depend on it.

@@ -136,7 +136,8 @@ impl Opening {
     /// Looks at all samples of all levels.
     fn survey(&self, on_progress: &mut OnProgress<'_>) -> Result<Facts, Problem> {
         let number = self.readers[0].array().number;
-        let bytes = |l: &Lattice| l.dims.iter().map(|&n| u64::from(n)).product::<u64>() * number.bytes();
+        let bytes =
+            |l: &Lattice| l.dims.iter().map(|&n| u64::from(n)).product::<u64>() * number.bytes();
         let total = self.lattices.iter().map(bytes).sum::<u64>();
         let first = bytes(&self.lattices[0]);
         let mut done = 0;
@@ -356,8 +357,7 @@ impl BlockSource for OmeZarrSource {
                 Some(codes) => Ok(Some(codes)),
                 None => self.chunk(level, at),
             };
-            let found: Result<Vec<_>, Problem> =
-                cells.par_iter().zip(cached).map(decode).collect();
+            let found: Result<Vec<_>, Problem> = cells.par_iter().zip(cached).map(decode).collect();
             for (&at, codes) in cells.iter().zip(found?) {
                 if let Some(codes) = codes {
                     paste(&codes, chunk_box(at, shape, dims), &mut out, (lo, hi));
@@ -464,8 +464,7 @@ fn numbers(reader: &LevelReader, lo: [u32; 3], hi: [u32; 3]) -> Result<Vec<u8>, 
     }
     let shape = reader.chunk_shape();
     for cells in cells(shape, lo, hi).chunks(AT_A_TIME) {
-        let found: Result<Vec<_>, Problem> =
-            cells.par_iter().map(|&at| reader.chunk(at)).collect();
+        let found: Result<Vec<_>, Problem> = cells.par_iter().map(|&at| reader.chunk(at)).collect();
         for (&at, chunk) in cells.iter().zip(found?) {
             if let Some(chunk) = chunk {
                 paste_rows(&chunk, chunk_box(at, shape, dims), &mut out, (lo, hi), size);
@@ -492,13 +491,7 @@ fn bytes_of(samples: &Samples) -> usize {
 
 impl ChunkCache {
     fn new(budget: usize) -> ChunkCache {
-        ChunkCache {
-            budget,
-            bytes: 0,
-            chunks: HashMap::new(),
-            by_use: BTreeMap::new(),
-            now: 0,
-        }
+        ChunkCache { budget, bytes: 0, chunks: HashMap::new(), by_use: BTreeMap::new(), now: 0 }
     }
 
     fn get(&mut self, key: (usize, [u32; 3])) -> Option<Arc<Samples>> {

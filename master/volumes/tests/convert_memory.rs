@@ -35,5 +35,5 @@ fn long_volume_is_converted_in_the_memory_of_its_planes() {
     let grew = memory_mib("VmHWM:").saturating_sub(before);
     // 64 planes of half a MiB, one and a half times, and what is on its way.
     println!("512 MiB of samples, grew by {grew} MiB");
-    assert!(grew <= 48 + 128, "grew by {grew} MiB");
+    assert!(grew <= 48 + 192, "grew by {grew} MiB");
 }

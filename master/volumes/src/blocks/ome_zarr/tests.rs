@@ -258,6 +258,19 @@ fn pyramid_that_changes_while_it_is_read_is_an_error_that_names_the_file() {
     assert!(read(&source).contains("was replaced or changed"), "{}", read(&source));
 }
 
+#[test]
+fn shape_of_chunks_that_are_not_there_is_refused_with_the_flag() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let meta = r#"{"zarr_format": 3, "node_type": "array", "shape": [2000, 2000, 2000],
+        "data_type": "uint8", "chunk_key_encoding": {"name": "default"}, "fill_value": 0,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [64, 64, 64]}},
+        "codecs": [{"name": "bytes"}]}"#;
+    put(folder.path(), "zarr.json", meta.as_bytes());
+    let e = OmeZarrSource::open(folder.path(), &Hints::default(), None, &mut silent);
+    let e = e.err().expect("too large").to_string();
+    assert!(e.contains("give --max-bytes 8000000000"), "{e}");
+}
+
 /// Metadata, shards and the sidecar with bytes changed, cut off or repeated: an error, or a picture; no
 /// panic.
 #[test]
@@ -297,7 +310,8 @@ fn mutants_of_a_pyramid_are_refused_or_read() {
                 }
             }
             std::fs::write(&path, &bytes).expect("a file");
-            let source = OmeZarrSource::open(&to, &Hints::default(), None, &mut silent);
+            let hints = Hints { max_bytes: Some(1 << 22), ..Hints::default() };
+            let source = OmeZarrSource::open(&to, &hints, None, &mut silent);
             let Ok(source) = source else { continue };
             for level in 0..source.levels().len() {
                 let dims = source.levels()[level].lattice.dims;

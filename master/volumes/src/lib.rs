@@ -30,8 +30,8 @@
 //! - DICOM series, one folder of slices (feature `dicom`)
 //! - Zarr arrays of versions 2 and 3, and OME-Zarr pyramids (feature `zarr`)
 //!
-//! [`write`](mod@write) writes NRRD and NIfTI-1. Not read: colours, time series, and volumes
-//! larger than memory.
+//! [`write`](mod@write) writes NRRD and NIfTI-1. [`blocks`] reads and writes volumes larger than memory.
+//! Not read: colours and time series.
 //!
 //! Input files are not trusted. A size in a header takes no memory before the bytes were seen;
 //! nothing outside the header's folder is read; every refusal is one line that names the file, the

@@ -12,8 +12,9 @@ use std::fs::File;
 use std::sync::mpsc::{Receiver, Sender, SyncSender};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Chunks of 128 KiB that a reader may be ahead of who takes them: 8 MiB.
-pub(crate) const CHUNKS_AHEAD: usize = 64;
+/// Chunks of 128 KiB that a reader may be ahead of who takes them: 64 MiB, so that a disk has work while
+/// planes are looked at.
+pub(crate) const CHUNKS_AHEAD: usize = 512;
 
 /// Takes the numbers of one file. Clones share it.
 #[derive(Clone, Debug, Default)]

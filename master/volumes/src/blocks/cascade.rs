@@ -140,9 +140,9 @@ impl<'a> Cascade<'a> {
             None => survey.slab(codes_seen, |_, _, _| (), |_, _| Ok(())),
             Some(writer) => {
                 let shape = writer.chunk_shape();
-                let pack = |lo: [u32; 3], hi: [u32; 3], part: &Samples| {
+                let pack = |lo: [u32; 3], hi: [u32; 3], part: Samples| {
                     let numbers = match own_seen.is_empty() {
-                        true => coding.numbers(part),
+                        true => coding.into_numbers(part),
                         false => cut_bytes(own_seen, size, dims, lo, hi),
                     };
                     let box_dims = std::array::from_fn(|a| hi[a] - lo[a]);

@@ -161,6 +161,13 @@ impl NumberRange {
     }
 }
 
+/// Returns the bytes of all items.
+fn words<T: Copy, const SIZE: usize>(items: &[T], bytes: impl Fn(T) -> [u8; SIZE]) -> Vec<u8> {
+    let mut all = vec![0; items.len() * SIZE];
+    all.chunks_exact_mut(SIZE).zip(items).for_each(|(to, &item)| to.copy_from_slice(&bytes(item)));
+    all
+}
+
 impl Coding {
     /// Returns the coding of numbers with this range, which is `None` for the types that need none.
     pub(crate) fn new(number: Number, rescale: ValueMap, range: Option<&NumberRange>) -> Coding {
@@ -305,10 +312,9 @@ impl Coding {
         match (self.form, codes) {
             (Form::Same, Samples::U8(v)) => v.clone(),
             (Form::Flipped, Samples::U8(v)) => v.iter().map(|c| c ^ 0x80).collect(),
-            (Form::Same | Form::Floats { .. }, codes) => codes.le_bytes(0..codes.len()).into(),
-            (Form::Flipped, Samples::U16(v)) => {
-                v.iter().flat_map(|c| (c ^ 0x8000).to_le_bytes()).collect()
-            }
+            (Form::Same, Samples::U16(v)) => words(v, u16::to_le_bytes),
+            (Form::Flipped, Samples::U16(v)) => words(v, |c| (c ^ 0x8000).to_le_bytes()),
+            (Form::Floats { .. }, Samples::F32(v)) => words(v, f32::to_le_bytes),
             (Form::Integers { min, .. }, Samples::U16(v)) => {
                 macro_rules! collect {
                     (f32) => {
@@ -348,6 +354,14 @@ impl Coding {
                 v.iter().flat_map(|&c| map.value(c.into()).to_le_bytes()).collect()
             }
             _ => panic!("codes of the coding's type"),
+        }
+    }
+
+    /// Returns the numbers of codes like [`Coding::numbers`], without a copy where they are the same.
+    pub(crate) fn into_numbers(&self, codes: Samples) -> Vec<u8> {
+        match (self.form, codes) {
+            (Form::Same, Samples::U8(v)) => v,
+            (_, codes) => self.numbers(&codes),
         }
     }
 

@@ -165,4 +165,6 @@ pub(crate) fn summaries_of(
 }
 
 #[cfg(test)]
+mod large_tests;
+#[cfg(test)]
 mod tests;

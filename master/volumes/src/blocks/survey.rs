@@ -150,7 +150,7 @@ impl Survey {
     pub(crate) fn slab<T: Send>(
         &mut self,
         codes: &Samples,
-        beside: impl Fn([u32; 3], [u32; 3], &Samples) -> T + Sync,
+        beside: impl Fn([u32; 3], [u32; 3], Samples) -> T + Sync,
         mut take: impl FnMut([u32; 2], Vec<T>) -> Result<(), Problem> + Send,
     ) -> Result<(), Problem> {
         let [nx, ny, _] = self.lattice.dims;
@@ -163,7 +163,7 @@ impl Survey {
             let hi = std::array::from_fn(|a| (lo[a] + BLOCK_EDGE).min(dims[a]));
             let part = copy_box(codes, dims, lo, hi);
             let held = held(&part, guess, counter.as_ref(), scratch);
-            (held, beside(lo, hi, &part))
+            (held, beside(lo, hi, part))
         };
         let mut all: Vec<Option<Held>> = Vec::new();
         all.resize_with(grid[0] as usize * grid[1] as usize, || None);

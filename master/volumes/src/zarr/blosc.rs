@@ -149,21 +149,45 @@ pub(crate) fn encode(numbers: &[u8], size: usize) -> Vec<u8> {
 
 /// Sorts bytes: first those that are first in their number, then the second ones, and so on.
 fn shuffle(numbers: &[u8], size: usize, out: &mut Vec<u8>) {
-    out.clear();
-    out.reserve(numbers.len());
-    for byte in 0..size {
-        out.extend(numbers.iter().skip(byte).step_by(size));
+    fn of<const SIZE: usize>(numbers: &[u8], out: &mut [u8]) {
+        for (byte, to) in out.chunks_exact_mut(numbers.len() / SIZE).enumerate() {
+            let words = numbers.chunks_exact(SIZE);
+            to.iter_mut().zip(words).for_each(|(to, word)| *to = word[byte]);
+        }
+    }
+    out.resize(numbers.len(), 0);
+    match size {
+        2 => of::<2>(numbers, out),
+        4 => of::<4>(numbers, out),
+        8 => of::<8>(numbers, out),
+        _ => unreachable!("numbers of one, two, four or eight bytes"),
     }
 }
 
 /// Undoes the byte shuffle: first bytes of all numbers, then second bytes, and so on. Bytes left
 /// over are not shuffled.
 fn unshuffle(plain: &[u8], size: usize, out: &mut Vec<u8>) {
-    let n = plain.len() / size;
-    for i in 0..n {
-        out.extend((0..size).map(|byte| plain[byte * n + i]));
+    fn of<const SIZE: usize>(plain: &[u8], out: &mut [u8]) {
+        let n = plain.len() / SIZE;
+        for (i, word) in out.chunks_exact_mut(SIZE).enumerate() {
+            (0..SIZE).for_each(|byte| word[byte] = plain[byte * n + i]);
+        }
     }
-    out.extend(&plain[n * size..]);
+    let n = plain.len() / size;
+    let (start, whole) = (out.len(), n * size);
+    match size {
+        2 | 4 | 8 => {
+            out.resize(start + whole, 0);
+            let to = &mut out[start..];
+            match size {
+                2 => of::<2>(&plain[..whole], to),
+                4 => of::<4>(&plain[..whole], to),
+                _ => of::<8>(&plain[..whole], to),
+            }
+        }
+        _ => (0..n).for_each(|i| out.extend((0..size).map(|byte| plain[byte * n + i]))),
+    }
+    out.extend(&plain[whole..]);
 }
 
 /// Undoes the bit shuffle of a block. c-blosc 1 leaves a block as it is whose numbers are no

@@ -8,6 +8,7 @@ use crate::blocks::sidecar::{self, Facts, Identity};
 use crate::blocks::survey::{Counter, Survey, count_between};
 use crate::blocks::{BLOCK_EDGE, BlockSource, BlockSummaries};
 use crate::error::{OpenErrorKind, Problem};
+use crate::limit::{ANY_FILE_BYTES, FILE_RATIO};
 use crate::samples::reserve;
 use crate::zarr::chunks::{LevelReader, Listing, Stamp, below, replaced};
 use crate::zarr::{Own, Picture};
@@ -49,6 +50,8 @@ struct Opening {
     lattices: Vec<Lattice>,
     listing: Arc<Listing>,
     stamps: Vec<(PathBuf, Stamp)>,
+    /// `--max-bytes`.
+    max_bytes: Option<u64>,
 }
 
 impl Opening {
@@ -87,6 +90,7 @@ impl Opening {
             readers,
             listing,
             stamps,
+            max_bytes: hints.max_bytes,
         })
     }
 
@@ -133,6 +137,25 @@ impl Opening {
         Ok(())
     }
 
+    /// Checks that the files of this picture may have so many bytes of samples. Chunks that are not there
+    /// are read, too, and a size in the metadata is cheap.
+    fn check_size(&self, samples: u64) -> Result<(), Problem> {
+        let stored = self.listing.files().map(|(_, stamp)| stamp.len).sum::<u64>();
+        let most = self.max_bytes.unwrap_or(ANY_FILE_BYTES.max(stored.saturating_mul(FILE_RATIO)));
+        match samples <= most {
+            true => Ok(()),
+            false => Err(Problem::new(
+                OpenErrorKind::TooLarge,
+                "shape",
+                format!(
+                    "{stored} bytes of files become {samples} bytes of samples, and only {most} are \
+                     looked at unasked"
+                ),
+                format!("give --max-bytes {samples} to read it all the same"),
+            )),
+        }
+    }
+
     /// Looks at all samples of all levels.
     fn survey(&self, on_progress: &mut OnProgress<'_>) -> Result<Facts, Problem> {
         let number = self.readers[0].array().number;
@@ -140,6 +163,7 @@ impl Opening {
             |l: &Lattice| l.dims.iter().map(|&n| u64::from(n)).product::<u64>() * number.bytes();
         let total = self.lattices.iter().map(bytes).sum::<u64>();
         let first = bytes(&self.lattices[0]);
+        self.check_size(total)?;
         let mut done = 0;
         let mut range = NumberRange::new(number);
         if let Some(range) = &mut range {

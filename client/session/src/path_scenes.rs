@@ -259,8 +259,8 @@ fn auto_level(
     Ok(finest.level())
 }
 
-/// Returns a level of a volume; `None` if that is the volume itself.
-fn at_level(volume: &Volume, level: u32) -> Option<Volume> {
+/// Returns a level of a volume, or its coarsest; `None` if that is the volume itself.
+pub fn at_level(volume: &Volume, level: u32) -> Option<Volume> {
     let own = volume.coarse.map_or(0, |coarse| coarse.level);
     let mut coarse: Option<Volume> = None;
     for _ in own..level {

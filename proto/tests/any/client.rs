@@ -183,7 +183,12 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
     ];
     let sums = prop_oneof![Just(Sums::Auto), Just(Sums::I32), Just(Sums::F32)];
     (
-        (("[A-Za-z0-9-]{1,60}", volume_choice(), level()), path, transfer, quality(sums)),
+        (
+            ("[A-Za-z0-9-]{1,60}", volume_choice().boxed(), level().boxed()),
+            path,
+            transfer,
+            quality(sums),
+        ),
         (work, format(), background, any::<[bool; 2]>()),
     )
         .prop_map(

@@ -390,7 +390,8 @@ async fn volume_that_is_put_over_a_noisy_line_arrives_whole() {
     assert!(noise[0].flips.load(Relaxed) > 5, "{:?}", noise[0]);
     let choice = VolumeChoice::Digest(volume.digest());
     let open = master.handle().library().open(&choice, Viewer::own()).expect("it is there");
-    assert_eq!(open.volume.samples, volume.samples);
+    let arrived = open.source.whole(open.level).expect("it is in memory");
+    assert_eq!(arrived.samples, volume.samples);
     stop.send_replace(true);
 }
 

@@ -195,6 +195,28 @@ impl InputArgs {
     }
 }
 
+#[cfg(feature = "zarr")]
+impl InputArgs {
+    /// Writes a volume as OME-Zarr with all levels into the folder `to`. With `replace`, a Zarr folder
+    /// that is there goes when the new one is whole. `on_progress` hears of bytes that are done and all.
+    ///
+    /// # Errors
+    /// The volume can't be read, or the folder not be written; `on_progress` returned an error.
+    pub fn convert(
+        &self,
+        from: &Path,
+        to: &Path,
+        replace: bool,
+        on_progress: &mut slabcast_volumes::blocks::ome_zarr::OnProgress<'_>,
+    ) -> Result<(), Fail> {
+        use slabcast_volumes::blocks::ome_zarr::convert;
+        let converted = convert(from, to, &self.hints(), replace, on_progress);
+        let converted = converted.map_err(|e| Fail::failed(e.to_string()))?;
+        converted.notes.iter().for_each(|note| progress::note(note));
+        Ok(())
+    }
+}
+
 /// Bytes of samples from which a volume's level is `auto` unless a flag says more: drawing all detail
 /// of it reads gigabytes.
 const AUTO_FROM_BYTES: u64 = 1 << 30;

@@ -26,7 +26,7 @@ use slabcast_session::record::{self, Recording};
 use slabcast_session::request::{RenderRequest, SceneArgs, UsualTurn, WorkArgs};
 use slabcast_session::source::{Cancel, Source, Update};
 use slabcast_session::{remote, runtime, signals, volume};
-use slabcast_volumes::blocks::BlockSource;
+use slabcast_volumes::blocks::{BlockSource, MemorySource};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -353,7 +353,7 @@ pub(crate) fn again(
     let runtime = runtime::start_embedded()?;
     let result = runtime.block_on(embedded(
         run,
-        Arc::new(volume),
+        Arc::new(MemorySource::of(volume)),
         orientation,
         WorkerGroup::new(1, None)?,
         None,

@@ -142,7 +142,7 @@ pub(crate) fn measure(of: &VolumeSceneArgs, threads: usize) -> Result<Savings, F
     if spec.volume.level > info.level {
         let request = request.in_all_detail();
         let with = Variant::new(&volume, &info, &request, orientation, Keep::default())?;
-        let ([less, more], _) = in_turn([(&base, quality), (&with, quality)], threads)?;
+        let ([less, more], _) = in_turn([(&base, quality), (&with, with.quality)], threads)?;
         let [x, y, z] = spec.volume.lattice.dims;
         rows.push(Row {
             name: "detail",

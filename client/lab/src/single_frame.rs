@@ -4,7 +4,7 @@ use crate::autotune::choose::settle;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::level::LevelChoice;
 use slabcast_common::message::SceneSpec;
-use slabcast_common::quality::{Quality, Sums, Work};
+use slabcast_common::quality::{Quality, Work};
 use slabcast_common::view::View;
 use slabcast_render::judge::reference::Reference;
 use slabcast_render::{Frame, Scene};
@@ -60,9 +60,8 @@ impl SingleFrame {
         }
         request.level = LevelChoice::default();
         let scenes = PathScenes::new(&volume, &info, &request, orientation)?;
-        let quality = Quality { sums: Sums::Auto, ..self.spec.quality };
-        let view = scenes.view_at_size(0, &quality, self.view.size)?;
-        let spec = SceneSpec { quality: self.spec.quality, ..scenes.spec(0) };
+        let spec = scenes.spec(0);
+        let view = scenes.view_at_size(0, &spec.quality, self.view.size)?;
         let background = self.background;
         let bricks = scenes.bricks;
         Ok(Some(SingleFrame { spec, view, drawn_view: view, magnify: 1, bricks, background }))

@@ -15,6 +15,7 @@ use slabcast_common::view::View;
 use slabcast_common::volume::{Lattice, Volume, VolumeInfo};
 use slabcast_render::{Frame, Scene};
 use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::levels::quality_at_level;
 use slabcast_scene::path::{Framing, Orientation};
 use slabcast_scene::tween::Tween;
 use slabcast_volumes::auto_level::AutoLevel;
@@ -88,6 +89,8 @@ pub struct PathScenes {
     asked: Lattice,
     /// World vector from its centre to that of the level that is drawn.
     to_level: DVec3,
+    /// Times that the volume was halved.
+    halvings: u32,
     /// Bricks that serve all frames of the path.
     pub bricks: Bricks,
     /// Target and height that the path was given, if it asked for them.
@@ -110,10 +113,6 @@ impl PathScenes {
         let tween = Tween::from_path(&request.path, &info.summary).map_err(blame)?;
         let framing =
             framing::framing(&request.path, volume, info, &transfer, orientation).map_err(blame)?;
-        let wanted =
-            BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, &request.quality)
-                .map_err(blame)?
-                .with_kept(request.work.keep);
         let mut request = request.clone();
         if let Some(framing) = &framing {
             request.path = request.path.framed(framing);
@@ -126,7 +125,12 @@ impl PathScenes {
         let coarse_info = coarse.as_ref().map(|coarse| coarse.info(coarse.digest()));
         let drawn = coarse_info.as_ref().unwrap_or(info);
         let to_level = info.lattice.to_centre_of(&drawn.lattice);
-        let wanted = wanted.at_centre(to_level);
+        request.quality = quality_at_level(request.quality, drawn.level - info.level);
+        let wanted =
+            BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, &request.quality)
+                .map_err(|e| request.blame(&e))?
+                .with_kept(request.work.keep)
+                .at_centre(to_level);
         let SceneBricks { spec: base, bricks } = SceneBricks::with_requirements(
             coarse.as_ref().unwrap_or(volume),
             drawn,
@@ -135,6 +139,7 @@ impl PathScenes {
             &wanted,
         )?;
         let shared = Arc::new(Scene::new(&base));
+        let halvings = drawn.level - info.level;
         let asked = info.lattice;
         Ok(PathScenes {
             request,
@@ -144,6 +149,7 @@ impl PathScenes {
             shared,
             asked,
             to_level,
+            halvings,
             bricks,
             framing,
         })
@@ -184,6 +190,11 @@ impl PathScenes {
             View::new(lattice, &camera, size, quality)
         });
         view.map_err(|e| self.request.blame(&e))
+    }
+
+    /// Returns the quality in which the level is drawn where `asked` is wanted.
+    pub fn quality_of_level(&self, asked: Quality) -> Quality {
+        quality_at_level(asked, self.halvings)
     }
 
     /// Returns the level of detail that is drawn.

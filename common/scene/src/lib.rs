@@ -33,6 +33,7 @@
 
 pub mod brick_needs;
 pub mod colour;
+pub mod levels;
 pub mod paraview;
 pub mod path;
 pub mod presets;

@@ -19,6 +19,7 @@ use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, VolumeInfo};
 use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::levels::quality_at_level;
 use slabcast_scene::path::{Framing, Prepared, ViewPath};
 use slabcast_scene::presets;
 use slabcast_scene::request::{PathRequest, function_bytes};
@@ -191,14 +192,15 @@ impl Plan {
         if info.level != asked.level {
             views.check(info, |_| ())?;
         }
-        let compositing = request.quality.compositing;
+        let quality = quality_at_level(request.quality, info.level - asked.level);
+        let compositing = quality.compositing;
         let tween = Tween::from_path(&request.path, &asked.summary)?;
-        let mut sums = request.quality.sums;
+        let mut sums = quality.sums;
         for tf in tween.iter().flat_map(Tween::key_functions).chain([&transfer]) {
             let classifier = Classifier::new(tf, info, compositing);
-            sums = classifier.choose_sums(&request.quality, &info.lattice)?;
+            sums = classifier.choose_sums(&quality, &info.lattice)?;
         }
-        let quality = Quality { sums, ..request.quality };
+        let quality = Quality { sums, ..quality };
         let wanted =
             BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), asked, &quality)?
                 .with_kept(request.work.keep)

@@ -128,6 +128,7 @@ impl Beside {
     }
 
     /// Returns a fresh one for a reader whose numbers go to a stream.
+    #[cfg(feature = "zarr")]
     pub(crate) fn streaming(stream: NumberStream) -> Beside {
         Beside { stream: Some(stream), ..Beside::default() }
     }

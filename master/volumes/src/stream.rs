@@ -9,11 +9,14 @@ use crate::error::Problem;
 use crate::samples::Layout;
 use slabcast_common::volume::{Lattice, SampleKind, Samples, ValueMap, ValueSummary, Volume};
 use std::fs::File;
-use std::sync::mpsc::{Receiver, Sender, SyncSender};
+#[cfg(feature = "zarr")]
+use std::sync::mpsc::Sender;
+use std::sync::mpsc::{Receiver, SyncSender};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Chunks of 128 KiB that a reader may be ahead of who takes them: 64 MiB, so that a disk has work while
 /// planes are looked at.
+#[cfg(feature = "zarr")]
 pub(crate) const CHUNKS_AHEAD: usize = 512;
 
 /// Takes the numbers of one file. Clones share it.
@@ -37,6 +40,7 @@ pub(crate) struct ChunkSender {
 }
 
 /// Receives chunks of numbers, in the file's byte order, and returns them for the next.
+#[cfg(feature = "zarr")]
 pub(crate) struct ChunkReceiver {
     pub(crate) from: Receiver<Vec<u8>>,
     pub(crate) spare: Sender<Vec<u8>>,
@@ -57,6 +61,7 @@ impl ChunkSender {
 
 impl NumberStream {
     /// Returns a stream for a header alone, and with a sender one for all numbers.
+    #[cfg(feature = "zarr")]
     pub(crate) fn new(sender: Option<ChunkSender>) -> NumberStream {
         NumberStream(Arc::new(Mutex::new(State { sender, ..State::default() })))
     }
@@ -90,6 +95,7 @@ impl NumberStream {
     }
 
     /// Returns whether the file can't be read in order.
+    #[cfg(feature = "zarr")]
     pub(crate) fn refused(&self) -> bool {
         self.state().refused
     }
@@ -105,6 +111,7 @@ impl NumberStream {
     }
 
     /// Returns the layout of the numbers, and their place if they lie in a file as they are.
+    #[cfg(feature = "zarr")]
     pub(crate) fn found(&self) -> (Option<Layout>, Option<(File, u64)>) {
         let mut state = self.state();
         (state.layout, state.place.take())

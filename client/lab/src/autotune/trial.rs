@@ -259,8 +259,9 @@ impl Trial {
     pub(crate) fn own_truth(&mut self, setting: &Setting, truth: &Truth) -> Result<Truth, Fail> {
         let threads = self.threads;
         let scenes = self.scenes(setting)?;
-        let spec = SceneSpec { quality: setting.quality, ..scenes.spec(truth.view) };
-        let view = scenes.view(truth.view, &setting.quality)?;
+        let quality = scenes.quality_of_level(setting.quality);
+        let spec = SceneSpec { quality, ..scenes.spec(truth.view) };
+        let view = scenes.view(truth.view, &quality)?;
         let reference = Reference::new(&spec, view, &scenes.bricks);
         let sample = truth.sample.clone();
         let limit = direct::map_parallel(sample.len(), threads, |i, _: &mut ()| {
@@ -338,7 +339,8 @@ impl Trial {
     fn prepare(&mut self, setting: &Setting, view: usize) -> Result<PreparedScene, Fail> {
         let quality = setting.quality;
         quality.check().map_err(|e| Fail::flag(&e))?;
-        let spec = self.scenes(setting)?.spec(view);
+        let scenes = self.scenes(setting)?;
+        let (spec, quality) = (scenes.spec(view), scenes.quality_of_level(quality));
         let classifier = Classifier::new(&spec.transfer, &spec.volume, quality.compositing);
         let sums =
             classifier.choose_sums(&quality, &spec.volume.lattice).map_err(|e| Fail::flag(&e))?;

@@ -10,6 +10,7 @@ use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
+use slabcast_scene::levels::quality_at_level;
 use slabcast_scene::path::{Orientation, PathView, ProjectionKind, ViewPath};
 use slabcast_scene::presets;
 use slabcast_scene::request::PathRequest;
@@ -242,8 +243,12 @@ impl Case {
         let volume = coarse.as_ref().unwrap_or(&self.volume);
         let info = volume.info(volume.digest());
         let to_level = self.info.lattice.to_centre_of(&info.lattice);
-        let SceneBricks { spec, bricks } =
-            SceneBricks::new(volume, &info, &self.transfer, self.quality)?;
+        let SceneBricks { spec, bricks } = SceneBricks::new(
+            volume,
+            &info,
+            &self.transfer,
+            quality_at_level(self.quality, self.level),
+        )?;
         let scene = Arc::new(Scene::new(&spec));
         let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
         let path = self.path();

@@ -142,7 +142,7 @@ impl<'a> Cascade<'a> {
                 let shape = writer.chunk_shape();
                 let pack = |lo: [u32; 3], hi: [u32; 3], part: Samples| {
                     let numbers = match own_seen.is_empty() {
-                        true => coding.into_numbers(part),
+                        true => coding.numbers_of(part),
                         false => cut_bytes(own_seen, size, dims, lo, hi),
                     };
                     let box_dims = std::array::from_fn(|a| hi[a] - lo[a]);

@@ -358,7 +358,7 @@ impl Coding {
     }
 
     /// Returns the numbers of codes like [`Coding::numbers`], without a copy where they are the same.
-    pub(crate) fn into_numbers(&self, codes: Samples) -> Vec<u8> {
+    pub(crate) fn numbers_of(&self, codes: Samples) -> Vec<u8> {
         match (self.form, codes) {
             (Form::Same, Samples::U8(v)) => v,
             (_, codes) => self.numbers(&codes),

@@ -1,9 +1,10 @@
 //! Sources of any size, and files that are read by offsets.
 
 use super::*;
+#[cfg(feature = "zarr")]
 use crate::Hints;
-use slabcast_common::volume::Volume;
 
+#[cfg(feature = "zarr")]
 fn silent(_: u64, _: u64) -> Result<(), Problem> {
     Ok(())
 }
@@ -83,7 +84,7 @@ fn raw_file_is_read_by_offsets_and_known_the_second_time() {
     let bytes: Vec<u8> =
         header.bytes().chain((0..130 * 70 * 3).flat_map(|i| code(i).to_be_bytes())).collect();
     std::fs::write(&path, &bytes).expect("a file");
-    let volume: Volume = crate::open(&path).expect("a volume");
+    let volume = crate::open(&path).expect("a volume");
     let cache = folder.path().join("cache");
     let mut calls = 0;
     for known in [false, true] {

@@ -31,11 +31,14 @@ pub(crate) struct Planes {
     /// Map from numbers to values.
     pub(crate) rescale: ValueMap,
     /// File and byte at which the numbers begin, and their byte order, if they lie there as they are.
-    pub(crate) place: Option<(File, u64, Endian)>,
+    pub(crate) place: Option<Place>,
     /// Choices that the reader made, one sentence each.
     pub(crate) notes: Vec<String>,
     from: From,
 }
+
+/// A file, the byte at which its numbers begin, and their byte order.
+pub(crate) type Place = (File, u64, Endian);
 
 enum From {
     File { path: PathBuf, hints: Hints, endian: Endian },
@@ -67,8 +70,9 @@ impl Planes {
                             endian: layout.endian,
                         };
                         let rescale = opened.volume.summary.map;
-                        let known = (layout.number, rescale, place, opened.notes);
-                        return Ok(Planes::new(&opened.volume, known, from));
+                        let number = (layout.number, rescale);
+                        let beside = (place, opened.notes);
+                        return Ok(Planes::new(&opened.volume, number, beside, from));
                     }
                 }
             }
@@ -80,12 +84,8 @@ impl Planes {
 
     fn new(
         volume: &Volume,
-        (number, rescale, place, notes): (
-            Number,
-            ValueMap,
-            Option<(File, u64, Endian)>,
-            Vec<String>,
-        ),
+        (number, rescale): (Number, ValueMap),
+        (place, notes): (Option<Place>, Vec<String>),
         from: From,
     ) -> Planes {
         Planes {
@@ -110,13 +110,13 @@ impl Planes {
     ) -> Planes {
         let map = volume.summary.map;
         if let Some(numbers) = numbers.filter(|numbers| numbers.belong_to(map)) {
-            let known = (numbers.number(), numbers.rescale, None, notes);
-            return Planes::new(&volume, known, From::Numbers(numbers));
+            let number = (numbers.number(), numbers.rescale);
+            return Planes::new(&volume, number, (None, notes), From::Numbers(numbers));
         }
         let (number, form, rescale) = number_form(&volume);
         let samples = volume.samples.clone();
         let coding = Coding { number, form, rescale };
-        Planes::new(&volume, (number, rescale, None, notes), From::Codes(samples, coding))
+        Planes::new(&volume, (number, rescale), (None, notes), From::Codes(samples, coding))
     }
 
     /// Returns the size of all numbers, in bytes.

@@ -2,6 +2,7 @@
 //! picture is true, and it is shut out.
 
 use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::message::{Pixels, ToMaster};
 use slabcast_common::quality::{Quality, Work};
 use slabcast_master::jobs::WatchItem;
@@ -36,6 +37,7 @@ fn request() -> PathRequest {
     PathRequest {
         client_key: "lies".into(),
         volume: VolumeChoice::Default,
+        level: LevelChoice::default(),
         path: ViewPath::from_turntable([150, 110], turn),
         transfer: TransferChoice::Name("auto".into()),
         quality: Quality::default(),

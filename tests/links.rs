@@ -6,6 +6,7 @@
 
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::message::{SceneSpec, ToWorker};
 use slabcast_common::quality::{Borders, Quality, Schedule, Sums, Work};
 use slabcast_common::stats::FrameStats;
@@ -39,6 +40,7 @@ fn request(key: &str, projection: ProjectionKind, work: Work) -> PathRequest {
     PathRequest {
         client_key: key.into(),
         volume: VolumeChoice::Default,
+        level: LevelChoice::default(),
         path: ViewPath::from_turntable([150, 110], turn),
         transfer: TransferChoice::Name("auto".into()),
         quality: Quality::before(),

@@ -11,6 +11,7 @@ use proxy::{Noise, Place, Proxy, Swallows};
 use sha2::{Digest, Sha256};
 use slabcast_client::{Client, ClientError, PATIENCE, Update, VolumeHeader};
 use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::message::{Hello, ToMaster, ToWorker};
 use slabcast_common::protocol::PROTOCOL_VERSIONS;
 use slabcast_common::quality::{Quality, Schedule, Work};
@@ -71,6 +72,7 @@ impl World {
         PathRequest {
             client_key: format!("job {}", self.jobs),
             volume: VolumeChoice::Default,
+            level: LevelChoice::default(),
             path: ViewPath::from_turntable([150, 110], turn),
             transfer: TransferChoice::Name(name.into()),
             quality: Quality::before(),
@@ -388,7 +390,8 @@ async fn volume_that_is_put_over_a_noisy_line_arrives_whole() {
     assert!(noise[0].flips.load(Relaxed) > 5, "{:?}", noise[0]);
     let choice = VolumeChoice::Digest(volume.digest());
     let open = master.handle().library().open(&choice, Viewer::own()).expect("it is there");
-    assert_eq!(open.volume.samples, volume.samples);
+    let arrived = open.source.whole(open.level).expect("it is in memory");
+    assert_eq!(arrived.samples, volume.samples);
     stop.send_replace(true);
 }
 

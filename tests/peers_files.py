@@ -245,6 +245,35 @@ def zarr():
                                       overwrite=True, dimension_names=["c", "z", "y", "x"])
         z[:] = a.transpose(3, 2, 1, 0)
         check("zarr, channels", "c.zarr", a[..., 2], "--channel", "2")
+        ours(kind)
+
+
+def ours(kind):
+    """OME-Zarr that slabcast writes, read by zarr: level 0 to the bit, and the levels' sizes and scales."""
+    x, y, z = 130, 67, 5
+    a = np.resize(numbers(kind).ravel(order="F"), x * y * z).reshape(z, y, x)
+    a[:, :, 64:128] = 0
+    name = f"ours_{x}x{y}x{z}_{np.dtype(kind).name}.raw"
+    a.astype(np.dtype(kind).newbyteorder("<")).tofile(name)
+    row = counts.setdefault("zarr, written by slabcast", [0, 0, 0])
+    said = run("convert", name, "ours.ome.zarr", "--spacing", "0.5x0.5x2", "--force", "-q")
+    if said.returncode:
+        row[2] += 1
+        print(f"refused: {name}: {said.stderr.strip()[:200]}")
+        return
+    group = peer["zarr"].open_group("ours.ome.zarr", mode="r")
+    image = group.attrs["ome"]["multiscales"][0]
+    levels = [group[d["path"]] for d in image["datasets"]]
+    scales = [d["coordinateTransformations"][0]["scale"] for d in image["datasets"]]
+    same = levels[0].dtype == np.dtype(kind) and levels[0][:].tobytes() == a.tobytes()
+    same = same and [level.shape for level in levels] == [(5, 67, 130), (5, 34, 65), (5, 17, 33)]
+    same = same and scales == [[2, 0.5, 0.5], [2, 1, 1], [2, 2, 2]]
+    if kind == "u1":
+        corners = [a[:, j:66:2, i::2].astype(int) for j in (0, 1) for i in (0, 1)]
+        same = same and np.array_equal((sum(corners) + 2) // 4, levels[1][:, :33, :])
+    row[0 if same else 1] += 1
+    if not same:
+        print(f"DIFFERS: {name}: {levels[0].dtype} {[l.shape for l in levels]} {scales}")
 
 
 def pydicom():

@@ -22,6 +22,7 @@ use processes::{Process, SLABCAST};
 use sha2::{Digest, Sha256};
 use slabcast_client::{Client, ClientError, FrameStream, JobState, ReceivedFrame, Update};
 use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_common::stats::FrameStats;
 use slabcast_master::jobs::{MAX_JOBS, WatchItem};
@@ -96,6 +97,7 @@ fn requests() -> Vec<PathRequest> {
         PathRequest {
             client_key: String::new(),
             volume: VolumeChoice::Default,
+            level: LevelChoice::default(),
             path: ViewPath::from_turntable([edge, edge * 3 / 4], turn),
             transfer: TransferChoice::Name(transfer.into()),
             quality: if after { Quality::default() } else { Quality::before() },

@@ -3,6 +3,7 @@
 use bytes::Bytes;
 use slabcast_client::{Client, ClientError, FrameStream, JobState, ReceivedFrame, Update};
 use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::stats::{FrameMs, FrameStats};
 use slabcast_proto::model::{Job, JobNotice};
@@ -270,6 +271,7 @@ fn request(key: &str) -> PathRequest {
     PathRequest {
         client_key: key.into(),
         volume: VolumeChoice::Default,
+        level: LevelChoice::default(),
         path: ViewPath::from_turntable([64, 64], Turntable::default()),
         transfer: TransferChoice::Name("auto".into()),
         quality: Quality::before(),

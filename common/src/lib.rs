@@ -30,6 +30,7 @@
 //! assert!(projected.rect.width() < 64 && projected.sheets.len() >= 32);
 //! ```
 
+pub mod block_set;
 pub mod blocks;
 pub mod bounds;
 pub mod brick;
@@ -38,6 +39,7 @@ pub mod gradient;
 pub mod ids;
 pub mod image;
 pub mod kernel;
+pub mod level;
 pub mod link;
 pub mod lookahead;
 pub mod math;
@@ -51,6 +53,7 @@ pub mod slab;
 pub mod spelling;
 pub mod stats;
 pub mod transfer;
+pub mod value_bins;
 pub mod view;
 pub mod volume;
 

@@ -4,11 +4,11 @@ use std::fmt;
 
 /// Newest version of `slabcast.cluster.v1` that this program speaks. Every change that an older
 /// peer would not survive raises it (`cluster.proto`, Versions).
-pub const PROTOCOL_VERSION: u32 = 8;
+pub const PROTOCOL_VERSION: u32 = 9;
 
 /// Versions of `slabcast.cluster.v1` that this program speaks.
 pub const PROTOCOL_VERSIONS: ProtocolVersions =
-    ProtocolVersions { oldest: 8, newest: PROTOCOL_VERSION };
+    ProtocolVersions { oldest: 9, newest: PROTOCOL_VERSION };
 
 /// Most render threads of one worker: five times those of the largest machine sold. More are a
 /// mistake, or a peer that lies.

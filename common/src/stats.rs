@@ -1,6 +1,7 @@
 //! Statistics of a frame: one line of JSON (docs/design/contracts.md, Statistics). Figures that
 //! nobody measured are `null`, never zero.
 
+use crate::level::LevelStats;
 use crate::quality::{Quality, Schedule};
 use serde::{Deserialize, Serialize};
 
@@ -224,6 +225,9 @@ pub struct FrameStats {
     pub left_out: Vec<LeftOut>,
     /// Errors of the picture, by source.
     pub error: ErrorStats,
+    /// Level of detail that was drawn; `null` where the master did not say.
+    #[serde(default)]
+    pub level: Option<LevelStats>,
     /// Number of leases given out again because their worker was lost or late.
     #[serde(default)]
     pub retries: u64,

@@ -12,7 +12,8 @@ use serde::{Deserialize, Serialize};
 /// Cap of the extinction per vox: 16 ln 2, an alpha of `1 - 2^-16` (docs/design/model.md section
 /// 1). It is part of the definition of the picture: silhouettes grow with the logarithm of sigma,
 /// so there is no limit to converge to. At 6.9 the worst alpha is 26/255 off, at 20 it is 34/255
-/// off the other way (docs/design/numerics.md section 2).
+/// off the other way (docs/design/numerics.md section 2). At coarser levels of detail it holds per
+/// vox of the level: what is opaque stays so, and sums keep their range.
 pub const SIGMA_MAX: f64 = 16.0 * std::f64::consts::LN_2;
 
 /// Cap, per vox, of extinctions given per world unit. Beyond it f32 sums of squares overflow.
@@ -46,7 +47,7 @@ pub enum ColorSpace {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OpacityUnit {
-    /// Alpha of one vox of travel, 0 to 1.
+    /// Alpha of one vox of travel, 0 to 1. At a coarser level of detail: of one vox of level 0.
     #[default]
     AlphaPerVox,
     /// Extinction per world unit, not negative.
@@ -212,16 +213,28 @@ pub struct OpticalSample {
 #[derive(Clone, Copy, Debug)]
 struct OpacityRule {
     unit: OpacityUnit,
+    /// Length of one vox of the level that is drawn, in world units.
     vox: f64,
+    /// The same in vox of level 0, of which an alpha is given.
+    coarseness: f64,
     compositing: Compositing,
 }
 
 impl OpacityRule {
-    /// Returns the extinction per vox, capped.
+    fn new(tf: &TransferFunction, info: &VolumeInfo, compositing: Compositing) -> OpacityRule {
+        OpacityRule {
+            unit: tf.opacity_unit,
+            vox: info.lattice.vox(),
+            coarseness: info.coarseness(),
+            compositing,
+        }
+    }
+
+    /// Returns the extinction per vox of the level that is drawn, capped.
     fn sigma(&self, a: f64) -> f64 {
         match self.unit {
             OpacityUnit::AlphaPerVox if a >= 1.0 => SIGMA_MAX,
-            OpacityUnit::AlphaPerVox => (-libm::log1p(-a)).min(SIGMA_MAX),
+            OpacityUnit::AlphaPerVox => (-libm::log1p(-a) * self.coarseness).min(SIGMA_MAX),
             OpacityUnit::Extinction => (a * self.vox).min(EXTINCTION_MAX),
         }
     }
@@ -290,14 +303,14 @@ impl Classifier {
         info: &VolumeInfo,
         compositing: Compositing,
     ) -> f64 {
-        let rule = OpacityRule { unit: tf.opacity_unit, vox: info.lattice.vox(), compositing };
+        let rule = OpacityRule::new(tf, info, compositing);
         rule.payload(largest_opacity(tf, info))
     }
 
     /// Makes `tf`, which passed its check, ready for a volume.
     pub fn new(tf: &TransferFunction, info: &VolumeInfo, compositing: Compositing) -> Self {
         let summary = info.summary.clone();
-        let rule = OpacityRule { unit: tf.opacity_unit, vox: info.lattice.vox(), compositing };
+        let rule = OpacityRule::new(tf, info, compositing);
         let decode = |c: f64| match tf.color_space {
             ColorSpace::Srgb => linear_from_srgb(c),
             ColorSpace::Linear => c,
@@ -332,7 +345,7 @@ impl Classifier {
         if !tf.gradient_opacity.is_empty() {
             let (lo, hi) = info.summary.range();
             let per_share = match tf.domain {
-                Domain::Unit => 1.0,
+                Domain::Unit => 1.0 / info.coarseness(),
                 Domain::Value => (hi - lo) / info.lattice.vox(),
             };
             c.gradient_points.clone_from(&tf.gradient_opacity);

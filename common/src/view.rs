@@ -383,6 +383,18 @@ impl View {
         Vec3::new(w.x as f32, w.y as f32, w.z as f32)
     }
 
+    /// Returns the pixels that a vox covers where the view shows it largest: at the nearest depth of a
+    /// box of voxels. `None` where the box reaches to the near plane or behind it.
+    pub fn largest_scale(&self, b: &TightBox) -> Option<f64> {
+        match self.projection {
+            Projection::Ortho { scale } => Some(scale),
+            Projection::Persp { focal, distance } => {
+                let depth = self.eye_box(b).0.z + distance;
+                (depth > NEAR * distance).then(|| focal / depth)
+            }
+        }
+    }
+
     /// Returns the eye-space box of the voxel centres of a box in index space.
     fn eye_box(&self, b: &TightBox) -> (DVec3, DVec3) {
         let lo = DVec3::from_array(b.lo.map(f64::from));

@@ -6,6 +6,7 @@ use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
+use std::convert::Infallible;
 
 /// Lattice of a volume's samples. World units are the file's (mm), world axes anatomical (RAS+)
 /// where the file has them (docs/design/contracts.md, World and camera).
@@ -60,6 +61,20 @@ impl Lattice {
         DMat3::from_cols(self.steps[0], self.steps[1], self.steps[2])
     }
 
+    /// Returns the matrix that [`Volume::gradient`] takes: the transposed inverse of
+    /// `world_from_index`, scaled to vox so that no unit overflows it.
+    ///
+    /// Its numbers are rounded to f32. Gradients of integers are fractions of small numbers, and
+    /// some lie just between two codes of a normal. In another unit of length the matrix has other
+    /// last bits, and one gradient in 10^4 or so would flip to the next code (the test below counts
+    /// 44 in 5 10^5 without the rounding; two voxels make 1 % of a small picture differ).
+    pub fn gradient_matrix(&self) -> DMat3 {
+        let vox = self.vox();
+        let m = DMat3::from_cols(self.steps[0] / vox, self.steps[1] / vox, self.steps[2] / vox);
+        let m = m.inverse().transpose();
+        DMat3::from_cols_array(&m.to_cols_array().map(|x| f64::from(x as f32)))
+    }
+
     /// Returns the index coordinates of the centre of the volume's box.
     pub fn centre_index(&self) -> DVec3 {
         let [x, y, z] = self.dims.map(|n| (n as f64 - 1.0) / 2.0);
@@ -69,6 +84,18 @@ impl Lattice {
     /// Returns the world position of the centre of the volume's box.
     pub fn centre(&self) -> DVec3 {
         self.origin + self.world_from_index() * self.centre_index()
+    }
+
+    /// Returns the world vector from the centre of this lattice's box to that of `other`, which is
+    /// another level of the same volume.
+    ///
+    /// Rounded to 1/65536 of a step, so that a far origin leaves no noise in it.
+    pub fn to_centre_of(&self, other: &Lattice) -> DVec3 {
+        let between = (other.origin - self.origin)
+            + (other.world_from_index() * other.centre_index()
+                - self.world_from_index() * self.centre_index());
+        let steps = self.world_from_index().inverse() * between;
+        self.world_from_index() * ((steps * 65536.0).round() / 65536.0)
     }
 
     /// Returns the largest extent in world units (N samples count as N spacings).
@@ -384,6 +411,15 @@ pub struct ValueCore {
 impl ValueSummary {
     /// Returns the range, the histogram and the counts of `samples`; `map` turns codes into values.
     pub fn from_samples(samples: &Samples, map: ValueMap) -> Self {
+        // Counted by code first: a bin needs a division, and there are 65536 codes at most but millions of
+        // samples.
+        let v = match (samples, samples.code_counts()) {
+            (_, Some(counts)) => {
+                return ValueSummary::from_code_counts(samples.kind(), &counts, map);
+            }
+            (Samples::F32(v), None) => v,
+            (_, None) => unreachable!("integers have counts"),
+        };
         let mut s = ValueSummary {
             kind: samples.kind(),
             map,
@@ -395,50 +431,83 @@ impl ValueSummary {
             anatomical: false,
             core: None,
         };
-        // Counted by code first: a bin needs a division, and there are 65536 codes at most but millions of
-        // samples.
-        let counts = samples.code_counts();
-        if let Some(counts) = &counts {
-            s.min_code = counts.iter().position(|&n| n > 0).unwrap_or(0) as f64;
-            s.max_code = counts.iter().rposition(|&n| n > 0).unwrap_or(0) as f64;
-            for (code, &n) in counts.iter().enumerate().filter(|(_, n)| **n > 0) {
-                let bin = s.bin(code as f64);
-                s.histogram[bin] += n;
+        let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
+        for &c in v {
+            if c.is_finite() {
+                lo = lo.min(c);
+                hi = hi.max(c);
+            } else if c.is_nan() {
+                s.nan += 1;
+            } else {
+                s.infinite += 1;
             }
         }
-        if let Samples::F32(v) = samples {
-            let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
-            for &c in v {
-                if c.is_finite() {
-                    lo = lo.min(c);
-                    hi = hi.max(c);
-                } else if c.is_nan() {
-                    s.nan += 1;
-                } else {
-                    s.infinite += 1;
-                }
-            }
-            if lo <= hi {
-                (s.min_code, s.max_code) = (lo as f64, hi as f64);
-            }
-            for &c in v.iter().filter(|c| c.is_finite()) {
-                let bin = s.bin(c as f64);
-                s.histogram[bin] += 1;
-            }
+        if lo <= hi {
+            (s.min_code, s.max_code) = (lo as f64, hi as f64);
         }
-        s.core = match (&counts, samples) {
-            (_, Samples::U8(_)) => None,
-            (Some(counts), _) => {
-                let some = || (0u32..).map(f64::from).zip(counts.iter().copied());
-                core::find(|| some().filter(|(_, n)| *n > 0), &s)
-            }
-            (None, Samples::F32(v)) => {
-                let finite = || v.iter().filter(|c| c.is_finite());
-                core::find(|| finite().map(|&c| (f64::from(c), 1)), &s)
-            }
-            (None, _) => None,
-        };
+        for &c in v.iter().filter(|c| c.is_finite()) {
+            let bin = s.bin(c as f64);
+            s.histogram[bin] += 1;
+        }
+        let count = |lo, hi| Ok::<_, Infallible>(core::counted(v, lo, hi));
+        s.core = core::find(&s, count).unwrap_or_else(|e| match e {});
         s
+    }
+
+    /// Returns the summary of samples of 8 or 16 bits that were counted: `counts[c]` is the number of
+    /// samples of code c. It equals [`ValueSummary::from_samples`] of the same samples.
+    ///
+    /// # Panics
+    /// If there are not 256 counts for 8 bits, or 65536 for 16.
+    pub fn from_code_counts(kind: SampleKind, counts: &[u64], map: ValueMap) -> Self {
+        assert_eq!(counts.len(), 1 << (8 * kind.bytes().min(2)), "one count for each code");
+        let first = counts.iter().position(|&n| n > 0).unwrap_or(0);
+        let last = counts.iter().rposition(|&n| n > 0).unwrap_or(0);
+        let present = || (first..=last).map(|c| (c as f64, counts[c])).filter(|(_, n)| *n > 0);
+        let mut s = ValueSummary {
+            kind,
+            map,
+            min_code: first as f64,
+            max_code: last as f64,
+            histogram: vec![0; 256],
+            nan: 0,
+            infinite: 0,
+            anatomical: false,
+            core: None,
+        };
+        for (code, n) in present() {
+            let bin = s.bin(code);
+            s.histogram[bin] += n;
+        }
+        let count = |lo, hi| {
+            let mut histogram = vec![0; 256];
+            present().for_each(|(code, n)| histogram[core::bin(code, lo, hi)] += n);
+            Ok::<_, Infallible>(histogram)
+        };
+        s.core = core::find(&s, count).unwrap_or_else(|e| match e {});
+        s
+    }
+
+    /// Finds the core of samples that do not lie in memory, and whose range, histogram and counts are
+    /// known. `count` counts the finite samples between two codes, each in the bin of
+    /// [`ValueSummary::core_bin`]; it is called only if ends of the range hold next to nothing, up to 41
+    /// times. The summary then equals [`ValueSummary::from_samples`] of the same samples.
+    ///
+    /// # Errors
+    /// Those of `count`.
+    pub fn find_core<E>(
+        &mut self,
+        count: impl FnMut(f64, f64) -> Result<Vec<u64>, E>,
+    ) -> Result<(), E> {
+        self.core = core::find(self, count)?;
+        Ok(())
+    }
+
+    /// Returns the bin, 0 to 255, of a finite code in a count between two codes; what lies beyond is in
+    /// the first or the last.
+    #[inline]
+    pub fn core_bin(code: f64, lo: f64, hi: f64) -> usize {
+        core::bin(code, lo, hi)
     }
 
     /// Returns the histogram bin of a finite code, 0 to 255.
@@ -490,8 +559,20 @@ pub struct Volume {
     pub lattice: Lattice,
     /// The samples, i fastest, then j, then k.
     pub samples: Samples,
-    /// Range, histogram, and map from codes to values.
+    /// Range, histogram, and map from codes to values. Of a coarser level that of level 0.
     pub summary: ValueSummary,
+    /// Place among the levels of detail of a volume; `None` of level 0.
+    pub coarse: Option<CoarseLevel>,
+}
+
+/// Place of a volume among the levels of detail of a finer one (docs/design/model.md, Levels of
+/// detail).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CoarseLevel {
+    /// Number of the level, 1 or more.
+    pub level: u32,
+    /// Length of one vox of level 0, in world units.
+    pub finest_vox: f64,
 }
 
 impl Volume {
@@ -516,6 +597,7 @@ impl Volume {
             lattice,
             samples,
             summary,
+            coarse: None,
         }
     }
 
@@ -533,15 +615,19 @@ impl Volume {
         Volume::new(name, "uint8", false, lattice, Samples::U8(v), ValueMap::IDENTITY)
     }
 
-    /// Returns the SHA-256 over lattice, value map and samples. Two volumes with one digest give
-    /// the same pictures; the name is not part of it.
+    /// Returns the SHA-256 over lattice, value map and samples; of a coarser level also over what
+    /// level 0 gives it. Two volumes with one digest give the same pictures; the name is not part
+    /// of it.
     pub fn digest(&self) -> Digest32 {
         let mut hasher = VolumeHasher::new(&self.lattice, self.summary.map, self.samples.kind());
         let count = self.samples.len();
         for begin in (0..count).step_by(1 << 15) {
             hasher.update(&self.samples.le_bytes(begin..count.min(begin + (1 << 15))));
         }
-        hasher.finish()
+        match &self.coarse {
+            None => hasher.finish(),
+            Some(coarse) => hasher.finish_level(coarse, &self.summary),
+        }
     }
 
     /// Returns the gradient of the raw field at sample (i, j, k) in world axes, in codes per vox:
@@ -565,27 +651,19 @@ impl Volume {
         *index_to_world_gradient * g
     }
 
-    /// Returns the matrix that [`Volume::gradient`] takes: the transposed inverse of
-    /// `world_from_index`, scaled to vox so that no unit overflows it.
-    ///
-    /// Its numbers are rounded to f32. Gradients of integers are fractions of small numbers, and
-    /// some lie just between two codes of a normal. In another unit of length the matrix has other
-    /// last bits, and one gradient in 10^4 or so would flip to the next code (the test below counts
-    /// 44 in 5 10^5 without the rounding; two voxels make 1 % of a small picture differ).
+    /// Returns [`Lattice::gradient_matrix`].
     pub fn gradient_matrix(&self) -> DMat3 {
-        let vox = self.lattice.vox();
-        let m = DMat3::from_cols(
-            self.lattice.steps[0] / vox,
-            self.lattice.steps[1] / vox,
-            self.lattice.steps[2] / vox,
-        );
-        let m = m.inverse().transpose();
-        DMat3::from_cols_array(&m.to_cols_array().map(|x| f64::from(x as f32)))
+        self.lattice.gradient_matrix()
     }
 
     /// Returns the volume without its samples; `digest` is its [`Volume::digest`].
     pub fn info(&self, digest: Digest32) -> VolumeInfo {
-        VolumeInfo { digest, lattice: self.lattice, summary: self.summary.clone() }
+        let (level, finest_vox) = match self.coarse {
+            Some(CoarseLevel { level, finest_vox }) => (level, finest_vox),
+            None => (0, self.lattice.vox()),
+        };
+        let summary = self.summary.clone();
+        VolumeInfo { digest, lattice: self.lattice, summary, level, finest_vox }
     }
 }
 
@@ -628,6 +706,20 @@ impl VolumeHasher {
     pub fn finish(self) -> Digest32 {
         Digest32(self.0.finalize().into())
     }
+
+    /// Returns the digest of a coarser level whose samples were added. `summary` is that of level 0,
+    /// of which range and opacities are.
+    pub fn finish_level(mut self, coarse: &CoarseLevel, summary: &ValueSummary) -> Digest32 {
+        self.0.update(b"level");
+        self.0.update(coarse.level.to_le_bytes());
+        for x in [coarse.finest_vox, summary.min_code, summary.max_code] {
+            self.0.update(x.to_le_bytes());
+        }
+        for n in summary.histogram.iter().chain([&summary.nan, &summary.infinite]) {
+            self.0.update(n.to_le_bytes());
+        }
+        self.finish()
+    }
 }
 
 /// A volume without its samples: what master, workers and clients share.
@@ -637,8 +729,36 @@ pub struct VolumeInfo {
     pub digest: Digest32,
     /// Lattice that the samples lie on.
     pub lattice: Lattice,
-    /// Range, histogram, and map from codes to values.
+    /// Range, histogram, and map from codes to values; of each level those of level 0.
     pub summary: ValueSummary,
+    /// Level of detail: 0 is the volume as it was read, each level after it is coarser.
+    pub level: u32,
+    /// Length of one vox of level 0 in world units; of level 0 itself [`Lattice::vox`].
+    pub finest_vox: f64,
+}
+
+impl VolumeInfo {
+    /// Returns the place among the levels of detail; `None` of level 0.
+    pub fn coarse(&self) -> Option<CoarseLevel> {
+        let (level, finest_vox) = (self.level, self.finest_vox);
+        (level > 0).then_some(CoarseLevel { level, finest_vox })
+    }
+
+    /// Returns [`Volume::digest`] of a volume with this description, whose samples `hasher` was given.
+    pub fn finish(&self, hasher: VolumeHasher) -> Digest32 {
+        match self.coarse() {
+            None => hasher.finish(),
+            Some(coarse) => hasher.finish_level(&coarse, &self.summary),
+        }
+    }
+
+    /// Returns the length of a vox of this level in vox of level 0; exactly 1 of level 0.
+    ///
+    /// Opacities and gradients of transfer functions are per vox of level 0. Whatever is counted per
+    /// vox of this level is multiplied or divided by this.
+    pub fn coarseness(&self) -> f64 {
+        if self.level == 0 { 1.0 } else { self.lattice.vox() / self.finest_vox }
+    }
 }
 
 /// A SHA-256 digest of 32 bytes, shown as 64 hexadecimal digits.

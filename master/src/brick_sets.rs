@@ -58,6 +58,13 @@ impl BrickSets {
         self.sets.iter().map(|held| &held.store).find(|s| s.key() == key)
     }
 
+    /// The last used set of the volume with digest `volume`, from which another may take blocks.
+    pub(crate) fn latest_of(&self, volume: Digest32) -> Option<Arc<BrickStore>> {
+        let is_of_volume = |s: &BrickStore| s.key() == s.needs().set_key(volume);
+        let mut stores = self.sets.iter().rev().map(|held| &held.store);
+        stores.find(|store| is_of_volume(store)).cloned()
+    }
+
     /// Notes that a set is used now.
     pub(crate) fn used(&mut self, key: BrickSetKey) {
         if let Some(i) = self.sets.iter().position(|held| held.store.key() == key) {
@@ -98,7 +105,7 @@ impl BrickSets {
             if fits(number, held_bytes) {
                 break;
             }
-            (number, held_bytes) = (number - 1, held_bytes - held.store.bytes());
+            (number, held_bytes) = (number - 1, held_bytes - held.store.kept_bytes());
             leaving.push(held.store.key());
         }
         if !fits(number, held_bytes) {
@@ -120,9 +127,14 @@ impl BrickSets {
         self.cutting = None;
     }
 
+    /// Forgets a set whose bricks can't be read any more.
+    pub(crate) fn forget(&mut self, key: BrickSetKey) {
+        self.sets.retain(|held| held.store.key() != key);
+    }
+
     /// Bytes of all sets that are held.
     fn bytes(&self) -> u64 {
-        self.sets.iter().map(|held| held.store.bytes()).sum()
+        self.sets.iter().map(|held| held.store.kept_bytes()).sum()
     }
 }
 

@@ -24,7 +24,7 @@ use crate::link::{Caller, WorkerLink};
 use crate::memory::Shares;
 use crate::record::RecordedScheduler;
 use slabcast_common::brick::BrickSetKey;
-use slabcast_common::ids::{FrameId, JobId, WorkerId};
+use slabcast_common::ids::{BrickId, FrameId, JobId, WorkerId};
 use slabcast_common::message::{Hello, SceneSpec, TOLD_TO_STOP, ToMaster, ToWorker};
 use slabcast_common::view::View;
 use slabcast_proto::model::Worker;
@@ -59,6 +59,8 @@ pub(crate) enum Event {
     },
     /// A brick set was cut.
     BricksCut { set: BrickSetKey, store: Result<Arc<BrickStore>, String> },
+    /// Bricks that were ordered for a worker can't be read.
+    BricksLost { worker: WorkerId, set: BrickSetKey, bricks: Vec<BrickId>, reason: String },
     /// A watcher took a frame, so that there may be room for another, or waits for one.
     FrameTaken,
     /// A frame was finished.
@@ -255,6 +257,9 @@ impl Driver {
                 let _ = reply.send(self.submit(*plan, peer));
             }
             Event::BricksCut { set, store } => self.bricks_cut(set, store),
+            Event::BricksLost { worker, set, bricks, reason } => {
+                self.bricks_lost(worker, set, bricks, &reason);
+            }
             Event::FrameTaken => {}
             Event::Finished { job, flight, frame } => self.finished(job, flight, frame),
             Event::FinishFailed { frame, reason } => self.fail_frame(frame, &reason),

@@ -12,6 +12,7 @@ use slabcast_common::ids::{FrameId, JobId};
 use slabcast_common::image::{
     Encoded, FrameAssembler, FrameState, Picture, PixelEncoding, PixelFormat, SparseTile,
 };
+use slabcast_common::level::LevelStats;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Classify, Quality};
@@ -238,6 +239,7 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
         stats.pixels_sha256 = "none: rehearsed".into();
     }
     stats.pixels_version = slabcast_common::PIXELS_VERSION;
+    stats.level = Some(LevelStats::of(&s.scene.volume, &s.view));
     let within = s.store.as_ref().and_then(|store| store.extent());
     let within = within.unwrap_or_else(|| TightBox::whole(s.scene.volume.lattice.dims));
     error(&mut stats.error, &s.scene, &s.view, &within, max_alpha);

@@ -6,7 +6,7 @@ use crate::finishers::Finishers;
 use crate::hooks::{Hooks, Stage};
 use crate::jobs::submit::{Plan, SubmitError, check_key};
 use crate::jobs::{JobView, Jobs, Watch};
-use crate::library::{Library, OpenVolume, Viewer};
+use crate::library::{Library, Viewer};
 use crate::link::{Caller, WorkerLink};
 use crate::memory::Shares;
 use crate::panics::caught;
@@ -268,8 +268,8 @@ impl Handle {
         let planned = self.reading(move |library| {
             caught("checking the request", || {
                 hooks.reach(Stage::Plan);
-                let OpenVolume { served, volume } = library.open(&request.volume, viewer)?;
-                Plan::new(request, &served, &volume, &shares).map_err(SubmitError::from)
+                let open = library.open(&request.volume, viewer)?;
+                Plan::new(request, &open, |level| library.level(&open, level), &shares)
             })
         });
         let plan = planned.await.ok_or(SubmitError::Gone)?;

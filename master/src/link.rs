@@ -4,13 +4,14 @@
 //! lies behind it. The embedded link passes the same messages over channels, and bricks as shared
 //! pointers; the TCP link ([`crate::serve`]) encodes both.
 
+use crate::driver::Event;
 use crate::hooks::Stage;
 use slabcast_common::brick::BrickSetKey;
-use slabcast_common::ids::BrickId;
+use slabcast_common::ids::{BrickId, WorkerId};
 use slabcast_common::link::BRICK_BATCHES_IN_FLIGHT;
 use slabcast_common::message::{BrickBatch, Hello, ToMaster, ToWorker};
 use slabcast_proto::convert::Bricks;
-use slabcast_volumes::BrickStore;
+use slabcast_volumes::{BrickStore, Problem};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use tokio::sync::{Semaphore, mpsc};
@@ -26,6 +27,8 @@ pub enum BrickOrder {
         store: Arc<BrickStore>,
         /// Ids of the bricks to send.
         bricks: Vec<BrickId>,
+        /// Takes the bricks that can't be read.
+        losses: Losses,
     },
     /// Has the worker forget bricks. Travels here and not among the control messages, since
     /// "forget 5" and a new brick 5 must not change places on the way.
@@ -35,6 +38,48 @@ pub enum BrickOrder {
         /// Ids of the bricks to forget.
         bricks: Vec<BrickId>,
     },
+}
+
+/// Tells the driver which bricks of an order were not sent, since their volume can't be read.
+pub struct Losses {
+    inbox: mpsc::Sender<Event>,
+    worker: WorkerId,
+    set: BrickSetKey,
+}
+
+impl Losses {
+    pub(crate) fn new(inbox: mpsc::Sender<Event>, worker: WorkerId, set: BrickSetKey) -> Losses {
+        Losses { inbox, worker, set }
+    }
+
+    /// Reports bricks that were not sent, and why.
+    pub(crate) async fn report(&self, bricks: &[BrickId], reason: String) {
+        let Losses { worker, set, .. } = *self;
+        let lost = Event::BricksLost { worker, set, bricks: bricks.to_vec(), reason };
+        let _ = self.inbox.send(lost).await;
+    }
+}
+
+/// Returns bricks of a store, in the form that `get` gives. Files are read on a thread for blocking
+/// work.
+///
+/// # Errors
+/// A file can't be read, for people.
+pub(crate) async fn bricks_of<T: Send + 'static>(
+    store: &Arc<BrickStore>,
+    ids: &[BrickId],
+    get: fn(&BrickStore, BrickId) -> Result<Option<T>, Problem>,
+) -> Result<Vec<T>, String> {
+    let collect = move |store: &BrickStore, ids: &[BrickId]| {
+        let found: Result<Vec<Option<T>>, Problem> = ids.iter().map(|id| get(store, *id)).collect();
+        found.map(|found| found.into_iter().flatten().collect()).map_err(|e| e.to_string())
+    };
+    if !store.may_read() {
+        return collect(store, ids);
+    }
+    let (store, ids) = (store.clone(), ids.to_vec());
+    let read = tokio::task::spawn_blocking(move || collect(&store, &ids)).await;
+    read.unwrap_or_else(|e| Err(format!("reading bricks: {e}; this is a bug of slabcast")))
 }
 
 /// The driver's end of a link to a worker. The link closes when the driver drops it.
@@ -185,11 +230,16 @@ pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
                         return;
                     }
                 }
-                BrickOrder::Send { set, store, bricks } => {
-                    for ids in bricks.chunks(BATCH_BRICKS) {
-                        let bricks = ids.iter().filter_map(|id| store.brick(*id));
-                        let batch =
-                            BrickBatch { set, bricks: bricks.collect(), broken: Vec::new() };
+                BrickOrder::Send { set, store, bricks, losses } => {
+                    for (i, ids) in bricks.chunks(BATCH_BRICKS).enumerate() {
+                        let found = match bricks_of(&store, ids, BrickStore::try_brick).await {
+                            Ok(found) => found,
+                            Err(reason) => {
+                                losses.report(&bricks[i * BATCH_BRICKS..], reason).await;
+                                break;
+                            }
+                        };
+                        let batch = BrickBatch { set, bricks: found, broken: Vec::new() };
                         if batch_tx.send(Bricks::Batch(batch)).await.is_err() {
                             return;
                         }

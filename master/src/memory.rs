@@ -8,6 +8,7 @@
 //! take 6 MB, which matters to nobody; at 8192x8192 they take up to 4.5 GB, which may end the
 //! machine or every other job of this master.
 
+use crate::library::OpenVolume;
 use slabcast_common::image::{FrameState, PixelFormat};
 use slabcast_common::quality::{InvalidField, Schedule};
 use slabcast_common::volume::VolumeInfo;
@@ -66,6 +67,15 @@ impl Shares {
             bricks: bytes / 4,
             requests: REQUESTS.min((bytes / 16) as usize),
         }
+    }
+
+    /// Returns the bytes of a set's contents that are kept in memory: all of a volume in memory if the
+    /// master has no limit, and a quarter of the free memory of a file.
+    pub(crate) fn bricks_kept(&self, open: &OpenVolume) -> u64 {
+        if self.bricks < u64::MAX || open.source.whole(open.level).is_some() {
+            return self.bricks;
+        }
+        available().map_or(u64::MAX, |free| free / 4)
     }
 
     /// Checks that the master has memory for the frames of a request.

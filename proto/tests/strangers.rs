@@ -296,6 +296,7 @@ fn wrong_path_is_refused_by_its_field_in_the_proto() {
     assert_eq!(request.path.turntable, Some(Default::default()));
     assert_eq!(request.quality, Default::default());
     assert_eq!(request.work, Default::default());
+    assert_eq!(request.level, Default::default());
     let field = |spoil: &dyn Fn(&mut SubmitPathRequest)| {
         let mut request = good();
         spoil(&mut request);
@@ -320,6 +321,10 @@ fn wrong_path_is_refused_by_its_field_in_the_proto() {
         field(&|r| r.work = Some(render_v1::Work { tile_edge, ..Default::default() })),
         "work.tile_edge: 17 is not",
     );
+    let level = |number| render_v1::LevelChoice {
+        choice: Some(render_v1::level_choice::Choice::Number(number)),
+    };
+    starts(field(&|r| r.level = Some(level(64))), "level.number: 64; give 0");
     let function = TransferFunction { domain: 1, ..Default::default() };
     starts(
         field(&|r| {

@@ -325,6 +325,7 @@ fn stats_with(tiles: usize) -> FrameStats {
         poisoned: vec![],
         critical_path: None,
         rehearsed: false,
+        level: None,
     }
 }
 

@@ -81,7 +81,8 @@ pub(crate) fn run(args: &CompareArgs) -> Result<(), Fail> {
         }
     };
     args.figure.check(false, true)?;
-    let request = args.scene.request_with_turn(Work::default(), UsualTurn::full(1))?;
+    let mut request = args.scene.request_with_turn(Work::default(), UsualTurn::full(1))?;
+    request.level = args.input.level();
     if !request.target.is_empty() {
         return Err(Fail::usage(format!(
             "{}: both pictures are drawn in the quality that is given; leave it out",

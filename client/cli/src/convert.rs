@@ -1,4 +1,7 @@
-//! `slabcast convert`: a volume of any format as NRRD or NIfTI.
+//! `slabcast convert`: a volume of any format as NRRD, NIfTI or OME-Zarr.
+
+#[cfg(feature = "zarr")]
+mod pyramid;
 
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress::{self, Progress};
@@ -6,9 +9,10 @@ use slabcast_session::{output, signals, volume};
 use slabcast_volumes::write::{self, Format};
 use std::path::{Path, PathBuf};
 
-/// Writes a volume as NRRD or NIfTI.
+/// Writes a volume as NRRD, NIfTI or OME-Zarr.
 ///
-/// Values, place and orientation stay.
+/// Values, place and orientation stay. OME-Zarr has all levels of detail, each half as fine as the one
+/// before, and is read piece by piece; most formats are converted slice by slice, whatever their size.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 The file is whole or not there. Numbers keep type and value, to the bit; where they have a slope that
@@ -17,16 +21,18 @@ the output can't hold, their values are written as float64, which a note says.
 Examples:
   slabcast convert scan.mha scan.nii.gz
   slabcast convert head.raw head.nrrd --dims 256x256x128 --type uint8 --spacing 1x1x1.5
-  slabcast convert slices/ slices.nrrd --encoding raw")]
+  slabcast convert slices/ slices.nrrd --encoding raw
+  slabcast convert large.nrrd large.ome.zarr")]
 pub(crate) struct ConvertArgs {
     #[arg(help = volume::VOLUME)]
     volume: PathBuf,
-    /// File to write; its name says how: .nrrd, .nii or .nii.gz
+    /// File to write; its name says how: .nrrd, .nii, .nii.gz, or .ome.zarr or .zarr (a folder)
     #[arg(value_name = "OUT")]
     output: PathBuf,
     #[command(flatten)]
     input: volume::InputArgs,
-    /// How samples are stored: raw or gzip [default: gzip for .nrrd and .nii.gz, raw for .nii]
+    /// How samples are stored: raw or gzip [default: gzip for .nrrd and .nii.gz, raw for .nii; lz4 for
+    /// .zarr]
     #[arg(long, value_name = "HOW", value_parser = ["raw", "gzip"])]
     encoding: Option<String>,
     /// Replace the file if it is there already
@@ -41,9 +47,14 @@ pub(crate) struct ConvertArgs {
 pub(crate) fn run(args: &ConvertArgs) -> Result<(), Fail> {
     let shown = args.output.display();
     let name = args.output.file_name().unwrap_or_default().to_string_lossy();
+    #[cfg(feature = "zarr")]
+    if name.to_ascii_lowercase().ends_with(".zarr") {
+        return pyramid::run(args);
+    }
     let Some(mut format) = Format::from_name(&name) else {
         return Err(Fail::usage(format!(
-            "OUT: `{shown}` names no format that is written; end it with .nrrd, .nii or .nii.gz"
+            "OUT: `{shown}` names no format that is written; end it with .nrrd, .nii, .nii.gz or \
+             .ome.zarr"
         )));
     };
     if let Some(encoding) = &args.encoding {

@@ -81,10 +81,37 @@ pub(crate) fn run(args: &InfoArgs) -> Result<(), Fail> {
         return orient::draw(&volume, &info, path);
     }
     let shares = shares(&volume, &info)?;
+    let levels = levels(&args.volume);
     if args.json {
-        return say(&format!("{:#}\n", json(&volume, &info, orientation, &shares)));
+        let mut json = json(&volume, &info, orientation, &shares);
+        if !levels.is_empty() {
+            json["levels"] =
+                levels.iter().map(|l| serde_json::json!({"dims": l.0, "spacing": l.1})).collect();
+        }
+        return say(&format!("{json:#}\n"));
     }
-    say(&text(&volume, &info, orientation, &shares))
+    let mut text = text(&volume, &info, orientation, &shares);
+    for (i, (dims, spacing)) in levels.iter().enumerate() {
+        let [nx, ny, nz] = dims;
+        let name = if i == 0 { "levels" } else { "" };
+        // Writing to a string does not fail.
+        let _ = writeln!(
+            text,
+            "{name:<12} {i}: {nx} x {ny} x {nz}, spacing {}",
+            triple(*spacing, " x ")
+        );
+    }
+    say(&text)
+}
+
+/// Returns samples and spacing of each level of a file with a pyramid.
+fn levels(path: &std::path::Path) -> Vec<([u64; 3], [f64; 3])> {
+    #[cfg(feature = "zarr")]
+    let levels = slabcast_volumes::blocks::ome_zarr::level_sizes(path);
+    #[cfg(not(feature = "zarr"))]
+    let levels = None;
+    let _ = path;
+    levels.unwrap_or_default()
 }
 
 /// Samples that are visible under each preset.

@@ -5,16 +5,16 @@
 //! so that a unit file needs none.
 
 use crate::systemd::{self, DRAIN};
-use slabcast_common::volume::Volume;
-use slabcast_master::library::{ReadFile, Unreadable, UploadConfig, Viewer};
+use slabcast_master::library::{ReadFile, Source, Unreadable, UploadConfig, Viewer};
 use slabcast_master::memory::{Shares, available};
 use slabcast_master::{Library, LibraryConfig, MasterConfig, PeerLimits};
-use slabcast_scene::path::{Axis, Orientation};
+use slabcast_scene::path::Axis;
 use slabcast_session::embedded::start_master;
 use slabcast_session::fail::{Fail, reason, say};
 use slabcast_session::machine::boot_id;
 use slabcast_session::progress::bytes;
 use slabcast_session::request::AxisArgs;
+use slabcast_session::volume::OpenedSource;
 use slabcast_session::{parse, record, runtime, signals, volume};
 use slabcast_volumes::{OpenError, OpenErrorKind};
 use std::net::SocketAddr;
@@ -134,16 +134,15 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
     let port = address.map_or(0, |address| address.port());
     let given = match &args.volume {
         Some(path) => {
-            let volume = args.input.open(path)?;
-            let orientation = axes.for_volume(&volume)?;
-            Some((Arc::new(volume), orientation))
+            let opened = args.input.open_source(path)?;
+            let orientation = axes.for_info(opened.info())?;
+            Some((opened.source, orientation))
         }
         None => None,
     };
-    let name = given.as_ref().map_or_else(|| "volumes".to_owned(), |(v, _)| v.name.clone());
-    let dims = given.as_ref().map(|(v, _)| v.lattice.dims);
-    let volume_bytes =
-        given.as_ref().map_or(0, |(v, _)| (v.samples.len() * v.samples.kind().bytes()) as u64);
+    let name = given.as_ref().map_or_else(|| "volumes".to_owned(), |(s, _)| s.name().to_owned());
+    let dims = given.as_ref().map(|(source, _)| source.levels()[0].lattice.dims);
+    let volume_bytes = given.as_ref().map_or(0, |(source, _)| source.memory_bytes());
     let library = library(args, given, port)?;
     let volumes = library.list(Viewer::own()).len();
     let mut config = MasterConfig::of(library);
@@ -244,29 +243,25 @@ impl MasterArgs {
 }
 
 /// Returns the volumes of the master: the one that was `given`, those of folders, and those of clients.
-fn library(
-    args: &MasterArgs,
-    given: Option<(Arc<Volume>, Orientation)>,
-    port: u16,
-) -> Result<Library, Fail> {
+fn library(args: &MasterArgs, given: Option<Source>, port: u16) -> Result<Library, Fail> {
     let axes = AxisArgs { up: args.up, front: args.front };
     let input = args.input.clone();
     let read: ReadFile = Arc::new(move |path, most_bytes| {
         let opened = input.read(path, most_bytes);
         // Clients are told the file's name, not its folder.
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let (volume, notes) = opened.map_err(|e| {
+        let (OpenedSource { source, .. }, notes) = opened.map_err(|e| {
             let is_too_large = e.problem.kind == OpenErrorKind::TooLarge;
             Unreadable { reason: OpenError { file: name, ..e }.to_string(), is_too_large }
         })?;
         for note in notes {
-            info!(volume = volume.name, "{note}");
+            info!(volume = source.name(), "{note}");
         }
-        let orientation = axes.for_volume(&volume).map_err(|e| {
+        let orientation = axes.for_info(&source.levels()[0]).map_err(|e| {
             let reason = e.line().unwrap_or_default().to_owned();
             Unreadable { reason, is_too_large: false }
         })?;
-        Ok((volume, orientation))
+        Ok((source, orientation))
     });
     let folder = match &args.uploads {
         _ if args.upload_quota == 0 => None,

@@ -48,6 +48,8 @@ struct Row {
 pub(crate) struct Savings {
     scene: String,
     size: [u32; 2],
+    /// Level of detail that is drawn.
+    level: u32,
     threads: usize,
     /// Median time of a frame as it is drawn.
     ms: f64,
@@ -124,7 +126,7 @@ fn in_turn(variants: [(&Variant, Quality); 2], threads: usize) -> Result<([f64; 
 
 /// Measures what the scene leaves out and what that saves.
 pub(crate) fn measure(of: &VolumeSceneArgs, threads: usize) -> Result<Savings, Fail> {
-    let request = of.scene.request(Work::default())?;
+    let request = of.request(Work::default())?;
     let OpenedVolume { volume, info, orientation } = of.open(&request)?;
     let mut progress = Progress::new(false);
     progress.phase("drawing with and without");
@@ -133,8 +135,33 @@ pub(crate) fn measure(of: &VolumeSceneArgs, threads: usize) -> Result<Savings, F
     let spec = base.scenes.spec(0);
     let quality = base.quality;
     let (voxels, bytes) = (base.voxels(), base.bytes());
-    let all: u64 = info.lattice.dims.iter().map(|&n| u64::from(n)).product();
+    let all: u64 = spec.volume.lattice.dims.iter().map(|&n| u64::from(n)).product();
     let mut rows = Vec::new();
+
+    // All detail, if a coarser level is drawn.
+    if spec.volume.level > info.level {
+        let request = request.in_all_detail();
+        let with = Variant::new(&volume, &info, &request, orientation, Keep::default())?;
+        let ([less, more], _) = in_turn([(&base, quality), (&with, with.quality)], threads)?;
+        let [x, y, z] = spec.volume.lattice.dims;
+        rows.push(Row {
+            name: "detail",
+            left_out: true,
+            why: format!(
+                "level {} of {x} x {y} x {z} samples is drawn, {} of {}; `lab error --level {}` says \
+                 what that costs",
+                spec.volume.level,
+                base.voxels(),
+                with.voxels(),
+                spec.volume.level
+            ),
+            bytes: Some(with.bytes().saturating_sub(bytes)),
+            ms: Some(more - less),
+            cut_ms: Some(with.cut_ms - base.cut_ms),
+            same: None,
+            force: "--level 0",
+        });
+    }
 
     // Things left out of the bricks.
     let mut kept = |name, why: String, keep: Keep, force| -> Result<(), Fail> {
@@ -252,6 +279,7 @@ pub(crate) fn measure(of: &VolumeSceneArgs, threads: usize) -> Result<Savings, F
     Ok(Savings {
         scene: format!("{}, {}", volume.name, request.transfer.name()),
         size: view.size,
+        level: spec.volume.level,
         threads,
         ms,
         relevant: voxels,
@@ -264,8 +292,9 @@ pub(crate) fn measure(of: &VolumeSceneArgs, threads: usize) -> Result<Savings, F
 pub(crate) fn text(savings: &Savings) -> String {
     let [w, h] = savings.size;
     let mut out = format!(
-        "{}, {w}x{h}: {:.1} ms a frame on {} thread{}; {} visible voxels in {} of bricks\n\n",
+        "{}, {w}x{h}, level {}: {:.1} ms a frame on {} thread{}; {} visible voxels in {} of bricks\n\n",
         savings.scene,
+        savings.level,
         savings.ms,
         savings.threads,
         if savings.threads == 1 { "" } else { "s" },
@@ -316,7 +345,7 @@ pub(crate) fn json(savings: &Savings) -> String {
         })
         .collect();
     serde_json::json!({
-        "scene": savings.scene, "size": savings.size, "threads": savings.threads, "ms": savings.ms,
+        "scene": savings.scene, "size": savings.size, "level": savings.level, "threads": savings.threads, "ms": savings.ms,
         "voxels": savings.relevant, "bytes": savings.bytes, "rows": rows,
     })
     .to_string()

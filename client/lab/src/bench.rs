@@ -61,12 +61,20 @@ pub struct BenchArgs {
 /// The arguments or the volume are refused, or no setting meets `--error` or `--budget`.
 pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     let work = Work { keep: args.keep.keep(), ..Work::default() };
-    let mut request = args.of.scene.request_with_target(work)?;
+    let mut request = args.of.request_with_target(work)?;
     let threads = args.threads.count();
     let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
     let volume = Arc::new(volume);
     settle(&volume, &info, &mut request, orientation, threads)?;
     let scenes = PathScenes::new(&volume, &info, &request, orientation)?;
+    // Errors are against all detail.
+    let detailed = if scenes.level() > info.level && args.pixels > 0 {
+        let request = request.in_all_detail();
+        Some(PathScenes::new(&volume, &info, &request, orientation)?)
+    } else {
+        None
+    };
+    let detailed = detailed.as_ref().unwrap_or(&scenes);
     let bricks = &scenes.bricks;
     drop(volume);
     let cut = Cut { threads, tile: args.tile, slabs: 1 };
@@ -89,7 +97,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
         if i == views / 2 {
             sha256 = picture.sha256().to_string();
             adds = frame.footprint_cost();
-            middle = Some((scenes.view_at_size(i, &request.quality, request.size())?, picture));
+            middle = Some((detailed.view_at_size(i, &request.quality, request.size())?, picture));
         }
         progress.step(progress::Step { frames: i as u64 + 1, ..Default::default() });
     }
@@ -102,13 +110,14 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     let relevant: u64 = bricks.iter().map(|b| b.len() as u64).sum();
     let errors = middle.filter(|_| args.pixels > 0).map(|(view, picture)| {
         let sample = stratified(request.size(), args.pixels as usize, args.seed);
-        let reference = Reference::new(&scenes.spec(views / 2), view, bricks);
+        let reference = Reference::new(&detailed.spec(views / 2), view, &detailed.bricks);
         let mut progress = Progress::new(false).counting("pixel");
         progress.frames(sample.len() as u64, "the reference");
         let after = quality.classify == Classify::After;
         let truth = direct::map_pixels(&sample, threads, (&mut progress, 0), |[x, y]| {
-            // Planes of a field have no sheets to compare with.
-            let same = (!after).then(|| reference.at_same_thickness(x, y));
+            // Planes of a field have no sheets to compare with, and another level has others.
+            let same = (!after && scenes.level() == detailed.level())
+                .then(|| reference.at_same_thickness(x, y));
             (reference.pixel(x, y), same)
         });
         progress.end();
@@ -131,7 +140,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
             "each_ms": each,
             "threads": threads, "tile": args.tile, "simd": simd, "size": request.size(),
             "magnify": request.magnify,
-            "quality": quality, "relevant": relevant, "pixels_sha256": sha256,
+            "quality": quality, "level": scenes.level(), "relevant": relevant, "pixels_sha256": sha256,
             "tossed": counters.tossed / n, "splatted": counters.splatted / n,
             "culled": counters.culled / n,
             // Sums that each voxel adds to: pixels, and bytes of each. Null if voxels differ.
@@ -143,9 +152,10 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     }
     let mut text = format!(
         "{median:.2} ms a frame: median of {n} views ({least:.2} to {most:.2}), {threads} {}, \
-         {simd}, {} sums\n{relevant} relevant voxels; a frame tosses {}, splats {}, culls {}\n",
+         {simd}, {} sums, level {}\n{relevant} relevant voxels; a frame tosses {}, splats {}, culls {}\n",
         if threads == 1 { "thread" } else { "threads" },
         format!("{:?}", quality.sums).to_lowercase(),
+        scenes.level(),
         counters.tossed / n,
         counters.splatted / n,
         counters.culled / n,

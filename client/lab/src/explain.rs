@@ -124,7 +124,7 @@ pub fn run(args: &ExplainArgs) -> Result<(), Fail> {
 
 fn explain_pixel(args: &ExplainArgs, pixel: [u32; 2]) -> Result<Explained, Fail> {
     // `request` refuses targets, since a magnified pixel has no sheets of its own.
-    args.of.scene.request(Default::default())?;
+    args.of.request(Default::default())?;
     let scene = SingleFrame::read(&args.of, 1, |[w, h]| {
         if pixel[0] < w && pixel[1] < h {
             return Ok(());

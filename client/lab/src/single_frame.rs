@@ -2,6 +2,7 @@
 
 use crate::autotune::choose::settle;
 use slabcast_common::image::{Background, Picture};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::view::View;
@@ -35,7 +36,7 @@ impl SingleFrame {
         threads: usize,
         check: impl FnOnce([u32; 2]) -> Result<(), Fail>,
     ) -> Result<SingleFrame, Fail> {
-        let mut request = args.scene.request_with_target(Work::default())?;
+        let mut request = args.request_with_target(Work::default())?;
         check(request.path.size)?;
         let OpenedVolume { volume, info, orientation } = args.open(&request)?;
         let volume = Arc::new(volume);
@@ -45,6 +46,25 @@ impl SingleFrame {
         let view = scenes.view_at_size(0, &request.quality, request.size())?;
         let (background, magnify) = (request.background, request.magnify);
         Ok(SingleFrame { spec, view, drawn_view, magnify, bricks: scenes.bricks, background })
+    }
+
+    /// Returns the same view in all detail; `None` if that is what is drawn.
+    pub(crate) fn in_all_detail(
+        &self,
+        args: &VolumeSceneArgs,
+    ) -> Result<Option<SingleFrame>, Fail> {
+        let mut request = args.request_with_target(Work::default())?;
+        let OpenedVolume { volume, info, orientation } = args.open(&request)?;
+        if self.spec.volume.level == info.level {
+            return Ok(None);
+        }
+        request.level = LevelChoice::default();
+        let scenes = PathScenes::new(&volume, &info, &request, orientation)?;
+        let spec = scenes.spec(0);
+        let view = scenes.view_at_size(0, &spec.quality, self.view.size)?;
+        let background = self.background;
+        let bricks = scenes.bricks;
+        Ok(Some(SingleFrame { spec, view, drawn_view: view, magnify: 1, bricks, background }))
     }
 
     /// Returns the frame at another quality with the same sheets and kernel.

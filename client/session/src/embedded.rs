@@ -13,11 +13,13 @@ use slabcast_common::protocol::MAX_THREADS;
 use slabcast_common::volume::Volume;
 use slabcast_master::SubmitError;
 use slabcast_master::jobs::{JobState, WatchItem};
+use slabcast_master::memory::available;
 use slabcast_master::record::Recorder;
-use slabcast_master::{Handle, Master, MasterConfig, ServedVolume, link};
+use slabcast_master::{Handle, Library, Master, MasterConfig, ServedVolume, link};
 use slabcast_render::Simd;
 use slabcast_scene::path::Orientation;
 use slabcast_scene::request::PathRequest;
+use slabcast_volumes::blocks::{BlockSource, MemorySource};
 use slabcast_worker::{BrickCache, Config, Ended, Link};
 use std::sync::Arc;
 use std::time::Duration;
@@ -90,7 +92,26 @@ impl Cluster {
         crew: WorkerGroup,
         record: Option<Recorder>,
     ) -> Result<Cluster, Fail> {
-        let mut config = MasterConfig::new(volume, orientation);
+        Cluster::of(Arc::new(MemorySource::of(volume)), orientation, crew, record)
+    }
+
+    /// Starts a master of a volume that is read in boxes, like [`Cluster::start`].
+    ///
+    /// # Errors
+    /// The system gives no threads.
+    pub fn of(
+        source: Arc<dyn BlockSource>,
+        orientation: Orientation,
+        crew: WorkerGroup,
+        record: Option<Recorder>,
+    ) -> Result<Cluster, Fail> {
+        // Workers share the master's bricks of a volume in memory. Of a file both drop what exceeds
+        // their memory.
+        let brick_bytes = match source.whole(0) {
+            Some(_) => SHARED,
+            None => available().map_or(SHARED, |free| free / 4 / u64::from(crew.workers.max(1))),
+        };
+        let mut config = MasterConfig::of(Library::of_source(source, orientation));
         config.schedule.silence = SILENCE;
         config.schedule.unresponsive_after = 0;
         config.record = record;
@@ -103,7 +124,7 @@ impl Cluster {
             let config = Config {
                 name: format!("embedded-{n}"),
                 threads: crew.threads,
-                memory_budget_bytes: SHARED,
+                memory_budget_bytes: brick_bytes,
                 simd: Simd::detect(),
                 rehearsal: None,
                 machine: String::new(),

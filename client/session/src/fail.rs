@@ -74,6 +74,11 @@ impl Fail {
         Fail { code: 1, ..self }
     }
 
+    /// Returns whether the command line is to blame (exit code 2).
+    pub fn is_usage(&self) -> bool {
+        self.code == 2
+    }
+
     /// Returns the line without `error: `, unless it was printed already.
     pub fn line(&self) -> Option<&str> {
         self.line.as_deref()

@@ -2,6 +2,8 @@
 
 use slabcast_client::with_default_port;
 use slabcast_common::image::Background;
+use slabcast_common::level::LevelChoice;
+use slabcast_common::quality::InvalidField;
 use slabcast_common::shade::Light;
 use slabcast_common::transfer::NanColour;
 use slabcast_common::view::MAX_EDGE;
@@ -194,6 +196,14 @@ pub fn master(text: &str) -> Result<String, String> {
 /// A line for the user that says what the flag takes, if `text` is anything else.
 pub fn listen(text: &str) -> Result<String, String> {
     host_port(text, true)
+}
+
+/// Parses a level of detail, or `auto`.
+///
+/// # Errors
+/// A line for the user that says what the flag takes, if `text` is anything else.
+pub fn level(text: &str) -> Result<LevelChoice, String> {
+    text.parse().map_err(|e: InvalidField| e.problem)
 }
 
 /// Parses the edge of a macrotile, or `auto`.

@@ -5,16 +5,21 @@
 use crate::direct::Bricks;
 use crate::fail::Fail;
 use crate::request::RenderRequest;
+use glam::DVec3;
 use slabcast_common::ids::SceneId;
+use slabcast_common::level::LevelChoice;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::Quality;
 use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
-use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_common::volume::{Lattice, Volume, VolumeInfo};
 use slabcast_render::{Frame, Scene};
 use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::levels::quality_at_level;
 use slabcast_scene::path::{Framing, Orientation};
 use slabcast_scene::tween::Tween;
+use slabcast_volumes::auto_level::AutoLevel;
+use slabcast_volumes::blocks::coarser;
 use slabcast_volumes::{BrickStore, framing};
 use std::sync::Arc;
 
@@ -80,6 +85,12 @@ pub struct PathScenes {
     tween: Option<Tween>,
     /// Scene of all frames if there is no tween; it caches footprints.
     shared: Arc<Scene>,
+    /// Lattice of the volume that was asked for, to which paths are relative.
+    asked: Lattice,
+    /// World vector from its centre to that of the level that is drawn.
+    to_level: DVec3,
+    /// Times that the volume was halved.
+    halvings: u32,
     /// Bricks that serve all frames of the path.
     pub bricks: Bricks,
     /// Target and height that the path was given, if it asked for them.
@@ -102,18 +113,46 @@ impl PathScenes {
         let tween = Tween::from_path(&request.path, &info.summary).map_err(blame)?;
         let framing =
             framing::framing(&request.path, volume, info, &transfer, orientation).map_err(blame)?;
-        let wanted =
-            BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, &request.quality)
-                .map_err(blame)?
-                .with_kept(request.work.keep);
-        let SceneBricks { spec: base, bricks } =
-            SceneBricks::with_requirements(volume, info, &transfer, request.quality, &wanted)?;
-        let shared = Arc::new(Scene::new(&base));
         let mut request = request.clone();
         if let Some(framing) = &framing {
             request.path = request.path.framed(framing);
         }
-        Ok(PathScenes { request, orientation, base, tween, shared, bricks, framing })
+        let level = match request.level {
+            LevelChoice::At(level) => level,
+            LevelChoice::Auto => auto_level(info, &request, orientation)?,
+        };
+        let coarse = at_level(volume, level);
+        let coarse_info = coarse.as_ref().map(|coarse| coarse.info(coarse.digest()));
+        let drawn = coarse_info.as_ref().unwrap_or(info);
+        let to_level = info.lattice.to_centre_of(&drawn.lattice);
+        request.quality = quality_at_level(request.quality, drawn.level - info.level);
+        let wanted =
+            BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, &request.quality)
+                .map_err(|e| request.blame(&e))?
+                .with_kept(request.work.keep)
+                .at_centre(to_level);
+        let SceneBricks { spec: base, bricks } = SceneBricks::with_requirements(
+            coarse.as_ref().unwrap_or(volume),
+            drawn,
+            &transfer,
+            request.quality,
+            &wanted,
+        )?;
+        let shared = Arc::new(Scene::new(&base));
+        let halvings = drawn.level - info.level;
+        let asked = info.lattice;
+        Ok(PathScenes {
+            request,
+            orientation,
+            base,
+            tween,
+            shared,
+            asked,
+            to_level,
+            halvings,
+            bricks,
+            framing,
+        })
     }
 
     /// Returns the scene of the `i`-th wanted frame, with the number type of its sums decided.
@@ -145,9 +184,22 @@ impl PathScenes {
     /// The quality or the size doesn't fit the view.
     pub fn view_at_size(&self, i: usize, quality: &Quality, size: [u32; 2]) -> Result<View, Fail> {
         let lattice = &self.base.volume.lattice;
-        let camera = self.request.path.camera(i, lattice, self.orientation);
-        let view = camera.and_then(|c| View::new(lattice, &c, size, quality));
+        let camera = self.request.path.camera(i, &self.asked, self.orientation);
+        let view = camera.and_then(|mut camera| {
+            camera.target -= self.to_level;
+            View::new(lattice, &camera, size, quality)
+        });
         view.map_err(|e| self.request.blame(&e))
+    }
+
+    /// Returns the quality in which the level is drawn where `asked` is wanted.
+    pub fn quality_of_level(&self, asked: Quality) -> Quality {
+        quality_at_level(asked, self.halvings)
+    }
+
+    /// Returns the level of detail that is drawn.
+    pub fn level(&self) -> u32 {
+        self.base.volume.level
     }
 
     /// Returns whether each frame has a transfer function of its own, between those of the keys.
@@ -177,6 +229,56 @@ impl PathScenes {
         let scene = Arc::new(Scene::new(&SceneSpec { quality, ..spec }));
         Ok(Frame::new(scene, self.view(i, &quality)?))
     }
+}
+
+/// Returns the level that `--level auto` stands for in a request that fits the volume.
+///
+/// # Errors
+/// The request doesn't fit the volume; the error names the flag or file.
+pub fn coarsest_level(
+    volume: &Volume,
+    info: &VolumeInfo,
+    request: &RenderRequest,
+    orientation: Orientation,
+) -> Result<u32, Fail> {
+    let blame = |e| request.blame(&e);
+    let transfer = request.transfer.function(info).map_err(blame)?;
+    let framing =
+        framing::framing(&request.path, volume, info, &transfer, orientation).map_err(blame)?;
+    let mut request = request.clone();
+    if let Some(framing) = &framing {
+        request.path = request.path.framed(framing);
+    }
+    auto_level(info, &request, orientation)
+}
+
+/// Returns the level that `auto` stands for, as a master finds it. The path of `request` is framed.
+fn auto_level(
+    info: &VolumeInfo,
+    request: &RenderRequest,
+    orientation: Orientation,
+) -> Result<u32, Fail> {
+    let cameras =
+        request.path.prepare(&info.lattice, orientation).map_err(|e| request.blame(&e))?;
+    let mut finest = AutoLevel::new(info);
+    for i in 0..request.path.frames() {
+        let view = cameras.camera(i).and_then(|camera| {
+            View::new(&info.lattice, &camera, request.path.size, &request.quality)
+        });
+        finest.see(&view.map_err(|e| request.blame(&e))?);
+    }
+    Ok(finest.level())
+}
+
+/// Returns a level of a volume, or its coarsest; `None` if that is the volume itself.
+pub fn at_level(volume: &Volume, level: u32) -> Option<Volume> {
+    let own = volume.coarse.map_or(0, |coarse| coarse.level);
+    let mut coarse: Option<Volume> = None;
+    for _ in own..level {
+        let Some(next) = coarser(coarse.as_ref().unwrap_or(volume)) else { break };
+        coarse = Some(next);
+    }
+    coarse
 }
 
 #[cfg(test)]

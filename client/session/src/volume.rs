@@ -3,11 +3,16 @@
 
 use crate::fail::Fail;
 use crate::parse;
-use crate::progress;
-use slabcast_common::volume::Volume;
-use slabcast_volumes::{FileNumbers, Hints, OpenError, Opened, Pick, RawHints};
+use crate::progress::{self, Progress};
+use slabcast_common::level::LevelChoice;
+use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_volumes::blocks::{BlockSource, MemorySource};
+use slabcast_volumes::{FileNumbers, Hints, OpenError, OpenErrorKind, Opened, Pick, RawHints};
 use std::ffi::OsString;
 use std::path::Path;
+#[cfg(feature = "zarr")]
+use std::path::PathBuf;
+use std::sync::Arc;
 
 /// Help text of every command's volume argument.
 pub const VOLUME: &str = "Volume file, folder with a stack or series, or formula:NAME";
@@ -44,10 +49,14 @@ pub struct InputArgs {
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     dataset: Option<String>,
-    /// Which level of an OME-Zarr pyramid, 0 the finest [default: the finest that fits]
-    #[arg(long, value_name = "N", allow_negative_numbers = true, help_heading = HEADING,
-          hide_short_help = true)]
-    level: Option<u32>,
+    /// Level of detail: auto, or 0 (all) and up, each half as fine [default: 0]
+    ///
+    /// auto draws at the level at which a sample covers about a pixel in the nearest view, which is
+    /// faster and looks alike. Of an OME-Zarr picture level N of the file is read, by default the
+    /// finest that fits into memory.
+    #[arg(long, value_name = "auto|N", value_parser = parse::level, allow_negative_numbers = true,
+          help_heading = HEADING)]
+    level: Option<LevelChoice>,
     /// Most bytes that the samples may take [default: 1 GiB or 64 times the file, in free memory]
     #[arg(long, value_name = "BYTES", value_parser = parse::memory, help_heading = HEADING,
           hide_short_help = true)]
@@ -97,16 +106,33 @@ impl InputArgs {
             series: self.series.clone(),
             dataset: self.dataset.clone(),
             dicom_reader: dicom_reader(),
-            level: self.level,
+            level: match self.level {
+                Some(LevelChoice::At(level)) => Some(level),
+                Some(LevelChoice::Auto) | None => None,
+            },
             max_bytes: self.max_bytes,
             pick: self.pick.pick(),
             ..Hints::default()
         }
     }
 
-    /// Returns whether none of the flags is given.
+    /// Returns whether no flag says what is in a file. A level of detail does not.
     pub fn is_empty(&self) -> bool {
-        *self == InputArgs::default()
+        InputArgs { level: None, ..self.clone() } == InputArgs::default()
+    }
+
+    /// Returns the level of detail to draw.
+    pub fn level(&self) -> LevelChoice {
+        self.level.unwrap_or_default()
+    }
+
+    /// Returns the level of detail to draw of a source: without a flag all detail of a volume in memory
+    /// or of less than 1 GiB, and `auto` of others.
+    pub fn level_of(&self, source: &dyn BlockSource) -> LevelChoice {
+        let finest = &source.levels()[0];
+        let bytes = finest.lattice.len() as u64 * finest.summary.kind.bytes() as u64;
+        let is_large = source.whole(0).is_none() && bytes > AUTO_FROM_BYTES;
+        self.level.unwrap_or(if is_large { LevelChoice::Auto } else { LevelChoice::default() })
     }
 
     /// Opens a file, a folder or a `formula:` volume and prints notes about it.
@@ -117,6 +143,26 @@ impl InputArgs {
         let opened = open_with(path, &self.hints())?;
         opened.notes.iter().for_each(|note| progress::note(note));
         Ok(opened.volume)
+    }
+
+    /// Opens a volume like [`InputArgs::open`] as a source of boxes: in memory, or, of a large pyramid,
+    /// in its file. Prints notes, and the progress of a first look at all samples.
+    ///
+    /// # Errors
+    /// Those of [`InputArgs::open`].
+    pub fn open_source(&self, path: &Path) -> Result<OpenedSource, Fail> {
+        let mut bar = None;
+        let mut told = |there: u64, total: u64| {
+            let bar = bar.get_or_insert_with(|| Progress::new(false).counting("MiB"));
+            bar.uploaded(there, total, &format!("{}: first look", path.display()));
+        };
+        let opened = source(path, &self.hints(), &mut told);
+        if let Some(bar) = bar {
+            bar.end();
+        }
+        let (opened, notes) = opened.map_err(|e| Fail::failed(e.to_string()))?;
+        notes.iter().for_each(|note| progress::note(note));
+        Ok(opened)
     }
 
     /// Opens a volume like [`InputArgs::open`], to write it: with the file's own numbers where the
@@ -138,12 +184,136 @@ impl InputArgs {
     ///
     /// # Errors
     /// The volume can't be read.
-    pub fn read(&self, path: &Path, most_bytes: u64) -> Result<(Volume, Vec<String>), OpenError> {
+    pub fn read(
+        &self,
+        path: &Path,
+        most_bytes: u64,
+    ) -> Result<(OpenedSource, Vec<String>), OpenError> {
         let mut hints = self.hints();
         hints.max_bytes = Some(hints.max_bytes.map_or(most_bytes, |asked| asked.min(most_bytes)));
-        let opened = slabcast_volumes::open_with(path, &hints)?;
-        Ok((opened.volume, opened.notes))
+        source(path, &hints, &mut |_, _| ())
     }
+}
+
+#[cfg(feature = "zarr")]
+impl InputArgs {
+    /// Writes a volume as OME-Zarr with all levels into the folder `to`. With `replace`, a Zarr folder
+    /// that is there goes when the new one is whole. `on_progress` hears of bytes that are done and all.
+    ///
+    /// # Errors
+    /// The volume can't be read, or the folder not be written; `on_progress` returned an error.
+    pub fn convert(
+        &self,
+        from: &Path,
+        to: &Path,
+        replace: bool,
+        on_progress: &mut slabcast_volumes::blocks::ome_zarr::OnProgress<'_>,
+    ) -> Result<(), Fail> {
+        use slabcast_volumes::blocks::ome_zarr::convert;
+        let converted = convert(from, to, &self.hints(), replace, on_progress);
+        let converted = converted.map_err(|e| Fail::failed(e.to_string()))?;
+        converted.notes.iter().for_each(|note| progress::note(note));
+        Ok(())
+    }
+}
+
+/// Bytes of samples from which a volume's level is `auto` unless a flag says more: drawing all detail
+/// of it reads gigabytes.
+const AUTO_FROM_BYTES: u64 = 1 << 30;
+
+/// A volume that was opened to be served.
+#[derive(Clone)]
+pub struct OpenedSource {
+    /// Source of its samples.
+    pub source: Arc<dyn BlockSource>,
+    /// The volume, if it is in memory.
+    pub volume: Option<Arc<Volume>>,
+}
+
+impl OpenedSource {
+    /// Returns the description of the finest level.
+    pub fn info(&self) -> &VolumeInfo {
+        &self.source.levels()[0]
+    }
+
+    /// Returns the volume for what needs all samples in memory; `flags` ask for it.
+    ///
+    /// # Errors
+    /// The volume is read from its file, block by block.
+    pub fn whole(&self, flags: &str) -> Result<Arc<Volume>, Fail> {
+        self.volume.clone().ok_or_else(|| {
+            let name = self.source.name();
+            Fail::usage(format!(
+                "{flags}: {name} is too large to be in memory as a whole; leave {flags} out, or give one \
+                 of its coarser levels with --level and --max-bytes"
+            ))
+        })
+    }
+}
+
+/// Opens a volume in memory; a large pyramid, and what does not fit, by blocks. `on_progress` gets the
+/// bytes looked at and those in all.
+fn source(
+    path: &Path,
+    hints: &Hints,
+    on_progress: &mut dyn FnMut(u64, u64),
+) -> Result<(OpenedSource, Vec<String>), OpenError> {
+    let of_file = |source| (OpenedSource { source, volume: None }, Vec::new());
+    if is_large(path, hints) {
+        return by_blocks(path, hints, on_progress).map(of_file);
+    }
+    match slabcast_volumes::open_with(path, hints) {
+        Ok(opened) => {
+            let volume = Arc::new(opened.volume);
+            let source = Arc::new(MemorySource::of(volume.clone()));
+            Ok((OpenedSource { source, volume: Some(volume) }, opened.notes))
+        }
+        Err(e) if e.problem.kind == OpenErrorKind::TooLarge => {
+            by_blocks(path, hints, on_progress).map(of_file).map_err(|_| e)
+        }
+        Err(e) => Err(e),
+    }
+}
+
+#[cfg(feature = "zarr")]
+use slabcast_volumes::blocks::is_large;
+
+#[cfg(feature = "zarr")]
+fn by_blocks(
+    path: &Path,
+    hints: &Hints,
+    on_progress: &mut dyn FnMut(u64, u64),
+) -> Result<Arc<dyn BlockSource>, OpenError> {
+    let mut told = |done, total| {
+        on_progress(done, total);
+        Ok(())
+    };
+    slabcast_volumes::blocks::open_source(path, hints, cache_folder().as_deref(), &mut told)
+}
+
+#[cfg(not(feature = "zarr"))]
+fn is_large(_path: &Path, _hints: &Hints) -> bool {
+    false
+}
+
+#[cfg(not(feature = "zarr"))]
+fn by_blocks(
+    path: &Path,
+    hints: &Hints,
+    _on_progress: &mut dyn FnMut(u64, u64),
+) -> Result<Arc<dyn BlockSource>, OpenError> {
+    let opened = slabcast_volumes::open_with(path, hints)?;
+    Ok(Arc::new(MemorySource::of(opened.volume)))
+}
+
+/// Returns the folder for what was found out about large volumes: `SLABCAST_CACHE`, or `slabcast` in the
+/// user's cache folder. `None` of a user without a home: it is found out each time.
+#[cfg(feature = "zarr")]
+fn cache_folder() -> Option<PathBuf> {
+    let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    let home = || variable("HOME").map(|home| home.join(".cache"));
+    let users = || variable("XDG_CACHE_HOME").or_else(home).map(|cache| cache.join("slabcast"));
+    variable("SLABCAST_CACHE").or_else(|| variable("CACHE_DIRECTORY")).or_else(users)
 }
 
 /// This program as it parses DICOM for another of its processes (`slabcast read-dicom`). Where the

@@ -5,11 +5,15 @@
 
 use crate::path::{CropBox, ViewPath};
 use crate::tween::Tween;
+use glam::DVec3;
 use sha2::{Digest, Sha256};
+use slabcast_common::block_set::BlockSet;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::quality::{Classify, InvalidField, Keep, Kernel, Quality};
 use slabcast_common::transfer::{Classifier, Support, TransferFunction};
+use slabcast_common::value_bins::ValueBins;
 use slabcast_common::volume::{Digest32, VolumeInfo};
+use std::sync::Arc;
 
 /// Index steps around a visible voxel whose voxels are stored where values are classified after
 /// reconstruction. A kernel reaches two steps; measured in docs/design/sharp.md.
@@ -33,6 +37,9 @@ pub struct BrickNeeds {
     pub coefficients: bool,
     /// Box outside of which no voxel is stored; `None` for the whole volume.
     pub crop: Option<CropBox>,
+    /// Blocks outside of which no brick is stored, since no frame shows them; `None` for the whole
+    /// volume.
+    pub window: Option<Arc<BlockSet>>,
 }
 
 impl BrickNeeds {
@@ -47,14 +54,17 @@ impl BrickNeeds {
                 halo: 0,
                 coefficients: false,
                 crop: None,
+                window: None,
             },
             Classify::After => BrickNeeds {
-                support: classifier.support().filled(&info.summary),
+                support: ValueBins::of(&info.summary)
+                    .rounded(&classifier.support().filled(&info.summary)),
                 normals: false,
                 gradients: false,
                 halo: HALO,
                 coefficients: quality.kernel == Kernel::Interpolating,
                 crop: None,
+                window: None,
             },
         }
     }
@@ -84,6 +94,7 @@ impl BrickNeeds {
             halo: a.halo.max(b.halo),
             coefficients: a.coefficients || b.coefficients,
             crop: None,
+            window: None,
         });
         Ok(BrickNeeds { crop, ..union.unwrap_or_default() })
     }
@@ -97,6 +108,14 @@ impl BrickNeeds {
         }
         self.normals |= keep.normals;
         self.gradients |= keep.gradients;
+        self
+    }
+
+    /// Returns the needs of a level of detail whose box has its centre at `centre`, a world vector from
+    /// that of level 0, to which cropping boxes are relative.
+    #[must_use]
+    pub fn at_centre(mut self, centre: DVec3) -> BrickNeeds {
+        self.crop = self.crop.map(|crop| CropBox { lo: crop.lo - centre, hi: crop.hi - centre });
         self
     }
 
@@ -116,6 +135,7 @@ impl BrickNeeds {
             && (self.normals || !other.normals)
             && (self.gradients || !other.gradients)
             && self.crop == other.crop
+            && self.window == other.window
     }
 
     /// Returns the key of the brick set of the volume with digest `volume`.
@@ -144,6 +164,10 @@ impl BrickNeeds {
                 h.update(x.to_le_bytes());
             }
         }
+        if let Some(window) = &self.window {
+            h.update(b"window");
+            window.words().iter().for_each(|word| h.update(word.to_le_bytes()));
+        }
         BrickSetKey(Digest32(h.finalize().into()))
     }
 }
@@ -162,6 +186,7 @@ mod tests {
             gradients: false,
             halo: 0,
             coefficients: false,
+            window: None,
             crop: crop.map(|c| {
                 let lattice = Lattice::from_spacing([9; 3], [1.0; 3]);
                 c.parse::<Crop>().unwrap().resolve(&lattice).unwrap()

@@ -7,6 +7,7 @@
 //!
 //! ```
 //! use slabcast_common::image::{Background, PixelFormat};
+//! use slabcast_common::level::LevelChoice;
 //! use slabcast_common::quality::{Quality, Work};
 //! use slabcast_scene::path::{Turntable, ViewPath};
 //! use slabcast_scene::request::{PathRequest, VolumeChoice};
@@ -16,6 +17,7 @@
 //! let request = PathRequest {
 //!     client_key: "a movie for Monday".into(),
 //!     volume: VolumeChoice::Name("head.nii.gz".into()),
+//!     level: LevelChoice::Auto,
 //!     path: ViewPath::from_turntable([640, 480], turn),
 //!     transfer: TransferChoice::Name("bone".into()),
 //!     quality: Quality::default(),
@@ -31,6 +33,7 @@
 
 pub mod brick_needs;
 pub mod colour;
+pub mod levels;
 pub mod paraview;
 pub mod path;
 pub mod presets;

@@ -3,6 +3,7 @@
 use crate::path::{Key, PathView, ViewPath};
 use crate::transfer::TransferChoice;
 use slabcast_common::image::{Background, PixelEncoding, PixelFormat};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::volume::Digest32;
@@ -26,6 +27,8 @@ pub struct PathRequest {
     pub client_key: String,
     /// Volume that is drawn.
     pub volume: VolumeChoice,
+    /// Level of detail of all frames.
+    pub level: LevelChoice,
     /// Views of the job, one for each frame.
     pub path: ViewPath,
     /// Colours and opacities of the volume: a preset or a whole transfer function.

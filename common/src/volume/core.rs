@@ -6,7 +6,7 @@
 //! in bins of its own, until little more can be cut. Volumes without such ends, nearly all, have no
 //! core: their range will do.
 
-use super::{ValueCore, ValueSummary};
+use super::{SampleKind, ValueCore, ValueSummary};
 
 /// Share of the samples that may lie beyond either end: 170 of a scan of 256^3. Fillings of teeth
 /// are ten times as many.
@@ -27,11 +27,15 @@ const ROUNDS: usize = 40;
 const ROOM: f64 = 0.1;
 
 /// Finds the core of samples whose range and histogram are `s`; `None` if there is no need of one.
-/// `codes` gives the finite codes, each with how many samples have it.
-pub(super) fn find<I: Iterator<Item = (f64, u64)>>(
-    codes: impl Fn() -> I,
+/// `count` counts the finite samples between two codes ([`bin`]); it is called for ends that hold next
+/// to nothing alone.
+pub(super) fn find<E>(
     s: &ValueSummary,
-) -> Option<ValueCore> {
+    mut count: impl FnMut(f64, f64) -> Result<Vec<u64>, E>,
+) -> Result<Option<ValueCore>, E> {
+    if s.kind == SampleKind::U8 {
+        return Ok(None);
+    }
     let padded = s.map.scale > 0.0;
     let (mut lo, mut hi) = (s.min_code, s.max_code);
     let (mut cut_below, mut histogram) = (false, s.histogram.clone());
@@ -47,16 +51,16 @@ pub(super) fn find<I: Iterator<Item = (f64, u64)>>(
         }
         cut_below |= first > 0;
         (lo, hi) = (a, b);
-        histogram = counted(codes(), lo, hi);
+        histogram = count(lo, hi)?;
     }
     if hi - lo > NARROW * (s.max_code - s.min_code) {
-        return None;
+        return Ok(None);
     }
     if cut_below {
         lo = (lo - ROOM * (hi - lo)).max(s.min_code);
-        histogram = counted(codes(), lo, hi);
+        histogram = count(lo, hi)?;
     }
-    (hi > lo).then_some(ValueCore { min_code: lo, max_code: hi, histogram })
+    Ok((hi > lo).then_some(ValueCore { min_code: lo, max_code: hi, histogram }))
 }
 
 /// Returns the first and the last bin that hold more than a few samples, the bin of padding left
@@ -80,11 +84,19 @@ fn trimmed(histogram: &[u64], negative: bool) -> (usize, usize) {
     (first, last)
 }
 
-fn counted(codes: impl Iterator<Item = (f64, u64)>, lo: f64, hi: f64) -> Vec<u64> {
-    let mut histogram = vec![0; 256];
+/// Returns the bin, 0 to 255, of a finite code in a count between two codes; what lies beyond is in
+/// the first or the last.
+#[inline]
+pub(super) fn bin(code: f64, lo: f64, hi: f64) -> usize {
     let scale = 256.0 / (hi - lo);
-    for (code, n) in codes {
-        histogram[(((code - lo) * scale).max(0.0) as usize).min(255)] += n;
+    (((code - lo) * scale).max(0.0) as usize).min(255)
+}
+
+/// Counts the finite samples between two codes, in bins as [`bin`] gives them.
+pub(super) fn counted(samples: &[f32], lo: f64, hi: f64) -> Vec<u64> {
+    let mut histogram = vec![0; 256];
+    for &code in samples.iter().filter(|c| c.is_finite()) {
+        histogram[bin(f64::from(code), lo, hi)] += 1;
     }
     histogram
 }

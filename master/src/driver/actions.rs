@@ -4,8 +4,9 @@ use super::{Driver, Flight};
 use crate::finish::{Assembly, FrameSums};
 use crate::finishers::FinishTask;
 use crate::jobs::{FinishedFrame, JobState};
-use crate::link::BrickOrder;
-use slabcast_common::ids::{Epoch, FrameId, JobId, TaskId, WorkerId};
+use crate::link::{BrickOrder, Losses};
+use slabcast_common::brick::BrickSetKey;
+use slabcast_common::ids::{BrickId, Epoch, FrameId, JobId, TaskId, WorkerId};
 use slabcast_common::image::{FrameState, SparseTile};
 use slabcast_common::message::ToWorker;
 use slabcast_common::occlusion::Rect;
@@ -15,6 +16,29 @@ use std::sync::Arc;
 use tracing::{debug, info, warn};
 
 impl Driver {
+    /// Tells the scheduler that bricks it had sent are not there: as if they had come and been
+    /// forgotten.
+    fn bricks_did_not_leave(&mut self, worker: WorkerId, set: BrickSetKey, bricks: Vec<BrickId>) {
+        let came = Happened::BricksIn { worker, set, bricks: bricks.len() as u32 };
+        self.scheduler.handle(&self.clock, came);
+        let gone = Happened::BricksForgotten { worker, set, bricks };
+        self.scheduler.handle(&self.clock, gone);
+    }
+
+    /// Fails the jobs of a set of which bricks can't be read any more.
+    pub(super) fn bricks_lost(
+        &mut self,
+        worker: WorkerId,
+        set: BrickSetKey,
+        bricks: Vec<BrickId>,
+        reason: &str,
+    ) {
+        warn!(%worker, set = %set.0, reason, "bricks can't be read");
+        self.bricks_did_not_leave(worker, set, bricks);
+        self.brick_sets.forget(set);
+        self.fail_jobs_of(set, reason);
+    }
+
     pub(super) fn act(&mut self) {
         while let Some(action) = self.scheduler.next_action() {
             match action {
@@ -31,15 +55,12 @@ impl Driver {
                     let Some(link) = self.workers.link(worker) else { continue };
                     if let Some(store) = self.brick_sets.get(set).cloned() {
                         debug!(%worker, bricks = bricks.len(), "bricks sent");
-                        let _ = link.bricks.send(BrickOrder::Send { set, store, bricks });
+                        let losses = Losses::new(self.inbox.clone(), worker, set);
+                        let _ = link.bricks.send(BrickOrder::Send { set, store, bricks, losses });
                     } else {
                         // A worker asked for bricks of a frame that ended, and their set has made
                         // place for another: as if they had come and been forgotten.
-                        let count = bricks.len() as u32;
-                        let came = Happened::BricksIn { worker, set, bricks: count };
-                        self.scheduler.handle(&self.clock, came);
-                        let gone = Happened::BricksForgotten { worker, set, bricks };
-                        self.scheduler.handle(&self.clock, gone);
+                        self.bricks_did_not_leave(worker, set, bricks);
                     }
                 }
                 Action::Drop { worker, reason } => {

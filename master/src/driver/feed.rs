@@ -19,14 +19,13 @@
 use super::{Driver, Event, Flight};
 use crate::hooks::Stage;
 use crate::jobs::active::Candidate;
-use crate::library::{Viewer, VolumeError};
+use crate::library::VolumeError;
 use crate::memory::{Shares, brick_set_bytes, making_bytes};
 use crate::panics::caught;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, JobId};
 use slabcast_common::link::{FRAMES_IN_FLIGHT, MOST_FRAMES_IN_FLIGHT};
 use slabcast_common::quality::Schedule;
-use slabcast_scene::request::VolumeChoice;
 use slabcast_schedule::{Clock, Event as Happened, FrameJob, Micros};
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
@@ -335,7 +334,8 @@ impl Driver {
         let table = self.jobs.lock();
         let is_needed = |key| self.active.open_need(&table, key);
         let stays = |key| in_flight(key) || (!comes_first && is_needed(key));
-        let (bytes, digest) = (brick_set_bytes(volume, &needs), volume.digest);
+        let digest = volume.digest;
+        let bytes = brick_set_bytes(volume, &needs).min(self.shares.bricks);
         let begins = self.brick_sets.begin_cut(key, bytes, now, stays, is_needed);
         drop(table);
         if !begins && comes_first {
@@ -344,14 +344,18 @@ impl Driver {
         if !begins {
             return;
         }
-        let library = self.library.clone();
+        let before = self.brick_sets.latest_of(digest);
+        let (library, shares) = (self.library.clone(), self.shares);
         let (inbox, hooks) = (self.inbox.clone(), self.hooks.clone());
         let cut = move || {
             let store = caught("cutting bricks", || {
                 hooks.reach(Stage::CutBricks);
                 // Its samples may have been dropped since the job was submitted.
-                let volume = library.open(&VolumeChoice::Digest(digest), Viewer::own())?.volume;
-                Ok(Arc::new(BrickStore::build(&volume, digest, &needs)))
+                let open = library.open_level(digest)?;
+                let kept = shares.bricks_kept(&open);
+                let store =
+                    BrickStore::cut(&open.source, open.level, &needs, before.as_deref(), kept);
+                store.map(Arc::new).map_err(|e| VolumeError::NotReadable(e.to_string()))
             });
             let store = store
                 .map_err(|panicked| panicked.to_string())
@@ -379,6 +383,11 @@ impl Driver {
     /// Fails the jobs whose set can't be cut.
     fn no_bricks(&mut self, set: BrickSetKey, reason: &str) {
         self.brick_sets.cut_failed();
+        self.fail_jobs_of(set, reason);
+    }
+
+    /// Fails the jobs that draw from a set.
+    pub(super) fn fail_jobs_of(&mut self, set: BrickSetKey, reason: &str) {
         let hit = |id: &JobId| self.active.get(*id).is_some_and(|job| job.scene.bricks == set);
         let jobs: Vec<JobId> = self.active.ids().filter(hit).collect();
         for job in jobs {

@@ -8,6 +8,7 @@ use crate::library::Viewer;
 use crate::memory::making_bytes;
 use crate::panics::caught;
 use slabcast_common::image::{Background, PixelFormat, SparseTile, TilePixels};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::message::{Counters, Pixels, RegionCost, TaskTimes, TileResult};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Quality, Schedule, Work};
@@ -39,6 +40,7 @@ fn request(key: &str, frames: u32, preset: &str) -> PathRequest {
     PathRequest {
         client_key: key.into(),
         volume: VolumeChoice::Default,
+        level: LevelChoice::default(),
         path: ViewPath::from_turntable(SIZE, Turntable { frames, ..Turntable::default() }),
         transfer: TransferChoice::Name(preset.into()),
         quality: Quality::before(),
@@ -394,8 +396,8 @@ async fn job_takes_memory_for_its_request_and_not_for_its_frames() {
     let open = handle.library().open(&VolumeChoice::Default, Viewer::own()).expect("it is there");
     let mut held = [0; 2];
     for (held, (key, frames)) in held.iter_mut().zip([("short", 1), ("long", 100_000)]) {
-        let plan =
-            Plan::new(request(key, frames, "grey"), &open.served, &open.volume, &Shares::default());
+        let level = |_| unreachable!("level 0 is there");
+        let plan = Plan::new(request(key, frames, "grey"), &open, level, &Shares::default());
         *held = plan.expect("a good request").held_bytes();
     }
     assert!(held[1] < 8192 && held[1].abs_diff(held[0]) < 16, "{held:?} bytes");

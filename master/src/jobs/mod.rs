@@ -15,6 +15,7 @@ pub mod submit;
 #[cfg(test)]
 mod tests;
 mod watcher;
+mod window;
 
 pub use watcher::{Watch, WatchItem};
 

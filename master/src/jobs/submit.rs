@@ -6,23 +6,27 @@
 //! ([`crate::Handle::submit`]) and the driver gets the finished plan.
 
 use super::active::ActiveJob;
-use super::{Job, JobState, JobView};
+use super::{Job, JobState, JobView, window};
 use crate::handle::unix_ms;
-use crate::library::{ServedVolume, VolumeError};
+use crate::library::{OpenVolume, VolumeError};
 use crate::memory::Shares;
+use glam::DVec3;
 use slabcast_common::ids::{JobId, SceneId};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{InvalidField, Quality};
 use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
-use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
+use slabcast_common::volume::{Digest32, VolumeInfo};
 use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::levels::quality_at_level;
 use slabcast_scene::path::{Framing, Prepared, ViewPath};
 use slabcast_scene::presets;
 use slabcast_scene::request::{PathRequest, function_bytes};
 use slabcast_scene::transfer::TransferChoice;
 use slabcast_scene::tween::Tween;
-use slabcast_volumes::framing::framing;
+use slabcast_volumes::auto_level::AutoLevel;
+use slabcast_volumes::framing::{FramingError, framing_of};
 use std::sync::Arc;
 
 /// Bytes of the longest `client_key`.
@@ -57,6 +61,17 @@ pub enum SubmitError {
     Panicked(String),
 }
 
+impl From<FramingError> for SubmitError {
+    fn from(error: FramingError) -> SubmitError {
+        match error {
+            FramingError::Field(field) => SubmitError::Refused(field),
+            FramingError::File(problem) => {
+                SubmitError::Volume(VolumeError::NotReadable(problem.to_string()))
+            }
+        }
+    }
+}
+
 /// A request that was checked, with all that its frames need.
 pub(crate) struct Plan {
     pub(crate) request: Arc<PathRequest>,
@@ -66,7 +81,10 @@ pub(crate) struct Plan {
     tween: Option<Tween>,
     views: Views,
     framing: Option<Framing>,
+    /// The level that is drawn.
     volume: VolumeInfo,
+    /// Digest of the volume that was asked for.
+    asked: Digest32,
 }
 
 /// The views of a path, each made when it is asked for.
@@ -75,6 +93,9 @@ pub(crate) struct Views {
     /// The path with the numbers of its framing, if it asked for them.
     framed: Option<Box<ViewPath>>,
     prepared: Prepared,
+    /// World vector from the centre of level 0, to which the path is relative, to that of the level
+    /// that is drawn.
+    to_level: DVec3,
 }
 
 impl Views {
@@ -87,17 +108,18 @@ impl Views {
         self.request.path.frames() as u64
     }
 
-    /// Makes a view of the volume `info`.
+    /// Makes a view of the level `info`.
     ///
     /// # Errors
     /// The field of the camera that can't be used.
     pub(crate) fn view(&self, number: u64, info: &VolumeInfo) -> Result<View, InvalidField> {
-        let camera = self.prepared.camera(self.path(), number as usize)?;
+        let mut camera = self.prepared.camera(self.path(), number as usize)?;
+        camera.target -= self.to_level;
         View::new(&info.lattice, &camera, self.request.path.size, &self.request.quality)
     }
 
-    /// Tries views: all that were given, else [`TRIED_VIEWS`] of the path.
-    fn check(&self, info: &VolumeInfo) -> Result<(), InvalidField> {
+    /// Tries views: all that were given, else [`TRIED_VIEWS`] of the path. Calls `each` with them.
+    fn check(&self, info: &VolumeInfo, mut each: impl FnMut(&View)) -> Result<(), InvalidField> {
         let last = self.len() - 1;
         let tried = if self.path().views.is_empty() {
             self.len().min(TRIED_VIEWS as u64)
@@ -106,7 +128,7 @@ impl Views {
         };
         (0..tried).try_for_each(|i| {
             let number = if tried > 1 { i * last / (tried - 1) } else { 0 };
-            self.view(number, info).map(drop)
+            self.view(number, info).map(|view| each(&view))
         })
     }
 
@@ -126,49 +148,68 @@ pub(crate) fn check_key(key: &str) -> Result<(), InvalidField> {
 }
 
 impl Plan {
-    /// Checks `request` against its volume and works out its views.
+    /// Checks `request` against its volume and works out its views. `open_level` makes a level of the
+    /// volume.
     ///
     /// # Errors
-    /// The field that can't be used.
+    /// The field that can't be used, or there is no memory for the level.
     pub(crate) fn new(
         request: PathRequest,
-        served: &ServedVolume,
-        volume: &Volume,
+        open: &OpenVolume,
+        open_level: impl FnOnce(u32) -> Result<OpenVolume, VolumeError>,
         shares: &Shares,
-    ) -> Result<Plan, InvalidField> {
-        let info = &served.info;
+    ) -> Result<Plan, SubmitError> {
+        let served = &*open.served;
+        let asked = &served.info;
         request.quality.check()?;
         request.work.check()?;
         request.path.check()?;
         shares.check(&request)?;
         let transfer: TransferFunction = match &request.transfer {
-            TransferChoice::Name(name) => presets::by_name(name, &info.summary)?,
+            TransferChoice::Name(name) => presets::by_name(name, &asked.summary)?,
             TransferChoice::Function(tf) => {
                 tf.check()?;
                 (**tf).clone()
             }
         };
-        let framing = framing(&request.path, volume, info, &transfer, served.orientation)?;
+        let framing = framing_of(&request.path, &*open.source, &transfer, served.orientation)?;
         let request = Arc::new(request);
         // The request stays as it came: the same key has to mean the same request.
         let framed = framing.as_ref().map(|f| Box::new(request.path.framed(f)));
         let path = framed.as_deref().unwrap_or(&request.path);
-        let prepared = path.prepare(&info.lattice, served.orientation)?.into_prepared();
-        let views = Views { request: request.clone(), framed, prepared };
-        views.check(info)?;
-        let compositing = request.quality.compositing;
-        let tween = Tween::from_path(&request.path, &info.summary)?;
-        let mut sums = request.quality.sums;
+        let prepared = path.prepare(&asked.lattice, served.orientation)?.into_prepared();
+        let to_level = DVec3::ZERO;
+        let mut views = Views { request: request.clone(), framed, prepared, to_level };
+        let mut finest = AutoLevel::new(asked);
+        views.check(asked, |view| finest.see(view))?;
+        let level = match request.level {
+            LevelChoice::At(level) => level,
+            LevelChoice::Auto => finest.level_of(open.source.levels()),
+        };
+        let drawn = if level > asked.level { open_level(level)? } else { open.clone() };
+        let info = &drawn.served.info;
+        views.to_level = asked.lattice.to_centre_of(&info.lattice);
+        if info.level != asked.level {
+            views.check(info, |_| ())?;
+        }
+        let quality = quality_at_level(request.quality, info.level - asked.level);
+        let compositing = quality.compositing;
+        let tween = Tween::from_path(&request.path, &asked.summary)?;
+        let mut sums = quality.sums;
         for tf in tween.iter().flat_map(Tween::key_functions).chain([&transfer]) {
             let classifier = Classifier::new(tf, info, compositing);
-            sums = classifier.choose_sums(&request.quality, &info.lattice)?;
+            sums = classifier.choose_sums(&quality, &info.lattice)?;
         }
-        let quality = Quality { sums, ..request.quality };
+        let quality = Quality { sums, ..quality };
         let wanted =
-            BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, &quality)?
-                .with_kept(request.work.keep);
-        let volume = info.clone();
-        Ok(Plan { request, wanted, transfer, quality, tween, views, framing, volume })
+            BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), asked, &quality)?
+                .with_kept(request.work.keep)
+                .at_centre(views.to_level);
+        let wanted = window::fit(wanted, &drawn, shares, |each| {
+            (0..views.len()).try_for_each(|number| views.view(number, info).map(|view| each(&view)))
+        })?;
+        let (volume, asked) = (info.clone(), asked.digest);
+        Ok(Plan { request, wanted, transfer, quality, tween, views, framing, volume, asked })
     }
 
     /// The job as the table shows it.
@@ -189,7 +230,7 @@ impl Plan {
                 size: request.path.size,
                 format: request.format,
                 framing: self.framing,
-                volume: self.volume.digest,
+                volume: self.asked,
                 submitted_unix_ms: unix_ms(),
                 finished_unix_ms: 0,
             },
@@ -213,13 +254,13 @@ impl Plan {
 
     /// The job as the driver renders it, from bricks with the needs `bricks`.
     pub(crate) fn activate(self, id: JobId, bricks: BrickNeeds) -> ActiveJob {
-        let Plan { request, wanted, transfer, quality, tween, views, framing: _, volume } = self;
+        let Plan { request, wanted, transfer, quality, tween, views, volume, .. } = self;
         let (crop, key) = (wanted.crop, bricks.set_key(volume.digest));
         let scene = SceneSpec { id: SceneId(id.0), volume, transfer, quality, crop, bricks: key };
         ActiveJob { request, scene: Arc::new(scene), tween, bricks, views, next: 0, begun: 0 }
     }
 
-    /// Digest of the volume.
+    /// Digest of the level that is drawn.
     pub(crate) fn volume(&self) -> Digest32 {
         self.volume.digest
     }

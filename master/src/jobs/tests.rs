@@ -4,6 +4,7 @@ use super::watcher::{TILE_NEWS, Watch, WatchItem};
 use super::*;
 use crate::driver::Event;
 use slabcast_common::image::Background;
+use slabcast_common::level::LevelChoice;
 use slabcast_common::quality::{Quality, Work};
 use slabcast_scene::path::{Turntable, ViewPath};
 use slabcast_scene::request::VolumeChoice;
@@ -31,6 +32,7 @@ fn frame(number: u64, bytes: usize) -> FinishedFrame {
         quality: Quality::before(),
         left_out: vec![],
         error: Default::default(),
+        level: None,
         retries: 0,
         handed_over: 0,
         dropped_results: 0,
@@ -55,6 +57,7 @@ fn job(id: JobId, frames: u64) -> Job {
     let request = PathRequest {
         client_key: client_key.clone(),
         volume: VolumeChoice::Default,
+        level: LevelChoice::default(),
         path: ViewPath::from_turntable([1, 1], Turntable::default()),
         transfer: TransferChoice::Name("auto".into()),
         quality: Quality::before(),

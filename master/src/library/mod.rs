@@ -10,6 +10,7 @@
 //! Every function here may read a file or wait for one: callers run on threads of their own, never on
 //! the driver's or the runtime's.
 
+mod levels;
 mod stored;
 #[cfg(test)]
 mod tests;
@@ -22,6 +23,7 @@ use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
 use slabcast_proto::model::{VolumeEntry, VolumeHeader, VolumeOrigin};
 use slabcast_scene::path::Orientation;
 use slabcast_scene::request::VolumeChoice;
+use slabcast_volumes::blocks::{BlockSource, MemorySource};
 use slabcast_volumes::endings;
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -56,12 +58,19 @@ pub struct ServedVolume {
 }
 
 impl ServedVolume {
-    fn new(volume: &Volume, orientation: Orientation, digest: Digest32) -> ServedVolume {
+    /// Describes a level of a source, which the library calls `name`.
+    fn of(
+        source: &dyn BlockSource,
+        level: usize,
+        name: &str,
+        orientation: Orientation,
+    ) -> ServedVolume {
+        let info = source.levels()[level].clone();
         ServedVolume {
-            name: volume.name.clone(),
-            file_type: volume.file_type.clone(),
-            anatomical: volume.anatomical,
-            info: volume.info(digest),
+            name: name.to_owned(),
+            file_type: source.file_type().to_owned(),
+            anatomical: info.summary.anatomical,
+            info,
             orientation,
         }
     }
@@ -76,14 +85,16 @@ pub struct Unreadable {
     pub is_too_large: bool,
 }
 
-/// Reads a file or folder as a volume whose samples take at most so many bytes, and finds its axes.
-pub type ReadFile =
-    Arc<dyn Fn(&Path, u64) -> Result<(Volume, Orientation), Unreadable> + Send + Sync>;
+/// A volume that was opened, in memory or as a file, and its axes.
+pub type Source = (Arc<dyn BlockSource>, Orientation);
+
+/// Opens a file or folder as a volume that takes at most so many bytes of memory, and finds its axes.
+pub type ReadFile = Arc<dyn Fn(&Path, u64) -> Result<Source, Unreadable> + Send + Sync>;
 
 /// Settings of a [`Library`].
 pub struct LibraryConfig {
-    /// Volume that the master is started with. It always stays in memory.
-    pub given: Option<(Arc<Volume>, Orientation)>,
+    /// Volume that the master is started with. It always stays open.
+    pub given: Option<Source>,
     /// Folder whose files are volumes.
     pub folder: Option<PathBuf>,
     /// Folder and quota of uploads; `None` refuses uploads.
@@ -145,13 +156,28 @@ impl Viewer {
     }
 }
 
-/// A volume with its samples.
+/// A volume, or a level of one, whose samples can be read.
 #[derive(Clone)]
 pub struct OpenVolume {
-    /// Description of the volume.
+    /// Description of the level.
     pub served: Arc<ServedVolume>,
-    /// The volume.
-    pub volume: Arc<Volume>,
+    /// Source of the samples.
+    pub source: Arc<dyn BlockSource>,
+    /// Index of the level among the source's.
+    pub level: usize,
+}
+
+impl OpenVolume {
+    /// Describes a level of a source, which the library calls `name`.
+    fn of(
+        source: Arc<dyn BlockSource>,
+        level: usize,
+        name: &str,
+        orientation: Orientation,
+    ) -> OpenVolume {
+        let served = Arc::new(ServedVolume::of(&*source, level, name, orientation));
+        OpenVolume { served, source, level }
+    }
 }
 
 /// See the head of the file.
@@ -168,6 +194,8 @@ pub struct Library {
 #[derive(Default)]
 struct Entries {
     by_name: BTreeMap<String, Entry>,
+    /// Levels of these volumes that were computed, by digest.
+    levels: BTreeMap<Digest32, levels::Level>,
     /// Counts uses.
     clock: u64,
 }
@@ -181,7 +209,10 @@ struct Entry {
     /// Address that put it there.
     uploader: Option<IpAddr>,
     served: Option<Arc<ServedVolume>>,
-    samples: Option<Arc<Volume>>,
+    /// Source of its samples, while it is open.
+    source: Option<Arc<dyn BlockSource>>,
+    /// Digests of the file's own levels, the finest first.
+    levels: Vec<Digest32>,
     /// Value of the clock when it was used last.
     used: u64,
     /// Why it can't be read, if that was tried.
@@ -203,7 +234,8 @@ impl Entry {
             stamp,
             uploader: None,
             served: None,
-            samples: None,
+            source: None,
+            levels: Vec::new(),
             used: 0,
             problem: None,
         }
@@ -238,11 +270,16 @@ fn sample_bytes(info: &VolumeInfo) -> u64 {
 impl Library {
     /// Returns the library of one volume.
     pub fn of(volume: impl Into<Arc<Volume>>, orientation: Orientation) -> Library {
+        Library::of_source(Arc::new(MemorySource::of(volume)), orientation)
+    }
+
+    /// Returns the library of one source.
+    pub fn of_source(source: Arc<dyn BlockSource>, orientation: Orientation) -> Library {
         let read: ReadFile = Arc::new(|path, _| {
             let reason = format!("{}: this master reads no files", path.display());
             Err(Unreadable { reason, is_too_large: false })
         });
-        let given = Some((volume.into(), orientation));
+        let given = Some((source, orientation));
         let config =
             LibraryConfig { given, folder: None, uploads: None, memory_bytes: u64::MAX, read };
         Library::new(config).expect("it has no folder")
@@ -260,13 +297,11 @@ impl Library {
         });
         let folder = folder.transpose()?;
         let mut entries = Entries::default();
-        if let Some((volume, orientation)) = given {
-            let mut entry = Entry::new(VolumeOrigin::Given, PathBuf::new(), Stamp::default());
-            let digest = volume.digest();
-            entry.served = Some(Arc::new(ServedVolume::new(&volume, orientation, digest)));
-            let name = volume.name.clone();
-            entry.samples = Some(volume);
-            entries.by_name.insert(name, entry);
+        if let Some((source, orientation)) = given {
+            let name = source.name().to_owned();
+            let entry = Entry::new(VolumeOrigin::Given, PathBuf::new(), Stamp::default());
+            entries.by_name.insert(name.clone(), entry);
+            entries.put(&name, &OpenVolume::of(source, 0, &name, orientation));
         }
         let uploads = uploads.map(Uploads::new).transpose()?;
         for (name, stored) in uploads.iter().flat_map(Uploads::found) {
@@ -303,7 +338,7 @@ impl Library {
                 read,
                 bytes: sampled.unwrap_or(entry.stamp.bytes),
                 origin: entry.origin,
-                in_memory: entry.samples.is_some(),
+                in_memory: entry.source.is_some(),
                 problem: entry
                     .problem
                     .clone()
@@ -456,12 +491,12 @@ impl Library {
                 _ => self.read_within_folder(path, room),
             };
             match read {
-                Ok((volume, orientation)) => {
-                    let volume = Volume { name: name.to_owned(), ..volume };
-                    let digest = volume.digest();
-                    let served = Arc::new(ServedVolume::new(&volume, orientation, digest));
-                    info!(volume = name, dims = ?volume.lattice.dims, %digest, "volume read");
-                    return Ok(OpenVolume { served, volume: Arc::new(volume) });
+                Ok((source, orientation)) => {
+                    let open = OpenVolume::of(source, 0, name, orientation);
+                    let VolumeInfo { lattice, digest, .. } = &open.served.info;
+                    let levels = open.source.levels().len();
+                    info!(volume = name, dims = ?lattice.dims, levels, %digest, "volume opened");
+                    return Ok(open);
                 }
                 Err(e) if e.is_too_large && self.lock().drop_oldest() => {}
                 Err(e) if e.is_too_large => return Err(VolumeError::NoRoom(e.reason, false)),
@@ -470,11 +505,7 @@ impl Library {
         }
     }
 
-    fn read_within_folder(
-        &self,
-        path: &Path,
-        room: u64,
-    ) -> Result<(Volume, Orientation), Unreadable> {
+    fn read_within_folder(&self, path: &Path, room: u64) -> Result<Source, Unreadable> {
         let unreadable = |reason| Unreadable { reason, is_too_large: false };
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let real = path.canonicalize().map_err(|e| unreadable(format!("{name}: {e}")))?;
@@ -638,7 +669,8 @@ impl Entries {
     fn take(&mut self, name: &str) -> Option<OpenVolume> {
         self.clock += 1;
         let entry = self.by_name.get_mut(name)?;
-        let open = OpenVolume { served: entry.served.clone()?, volume: entry.samples.clone()? };
+        let (served, source) = (entry.served.clone()?, entry.source.clone()?);
+        let open = OpenVolume { served, source, level: 0 };
         entry.used = self.clock;
         Some(open)
     }
@@ -647,7 +679,8 @@ impl Entries {
         self.clock += 1;
         if let Some(entry) = self.by_name.get_mut(name) {
             entry.served = Some(open.served.clone());
-            entry.samples = Some(open.volume.clone());
+            entry.levels = open.source.levels().iter().map(|level| level.digest).collect();
+            entry.source = Some(open.source.clone());
             entry.problem = None;
             entry.used = self.clock;
         }
@@ -667,7 +700,8 @@ impl Entries {
     /// Bytes of the samples in memory that may be dropped.
     fn held_bytes(&self) -> u64 {
         let held = self.by_name.values().filter(|e| e.may_be_dropped());
-        held.filter_map(|e| e.served.as_ref()).map(|s| sample_bytes(&s.info)).sum()
+        let bytes = held.filter_map(|e| e.source.as_ref()).map(|source| source.memory_bytes());
+        bytes.sum::<u64>() + self.level_bytes()
     }
 
     /// Bytes of the files of uploads.
@@ -678,16 +712,24 @@ impl Entries {
 
     /// Drops the samples that were unused for longest. False if there are none to drop.
     fn drop_oldest(&mut self) -> bool {
+        let level = self.oldest_level();
         let held = self.by_name.values_mut().filter(|e| e.may_be_dropped());
-        let Some(oldest) = held.min_by_key(|e| e.used) else { return false };
-        oldest.samples = None;
+        let file = held.min_by_key(|e| e.used);
+        match (level, file) {
+            (None, None) => return false,
+            (Some((used, digest)), file) if file.as_ref().is_none_or(|f| used < f.used) => {
+                self.drop_level(digest);
+            }
+            (_, Some(file)) => file.source = None,
+            (Some(_), None) => unreachable!("a level goes where there is no file"),
+        }
         true
     }
 }
 
 impl Entry {
     fn may_be_dropped(&self) -> bool {
-        self.origin != VolumeOrigin::Given && self.samples.is_some()
+        self.origin != VolumeOrigin::Given && self.source.is_some()
     }
 }
 

@@ -10,15 +10,17 @@
 //! | ... | the header |
 //! | ... | the samples, little-endian, i fastest |
 
-use super::Unreadable;
+use super::{Source, Unreadable};
 use prost::Message;
 use slabcast_common::volume::{Samples, Volume};
 use slabcast_proto::convert;
 use slabcast_proto::model::VolumeHeader;
-use slabcast_scene::path::Orientation;
+use slabcast_volumes::blocks::MemorySource;
+
 use std::fs::File;
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// First bytes of the file.
 const MAGIC: [u8; 16] = *b"slabcast volume\n";
@@ -73,7 +75,7 @@ pub(super) fn find(path: &Path) -> io::Result<Stored> {
 }
 
 /// Reads an uploaded volume whose samples take at most `most_bytes`.
-pub(super) fn read(path: &Path, most_bytes: u64) -> Result<(Volume, Orientation), Unreadable> {
+pub(super) fn read(path: &Path, most_bytes: u64) -> Result<Source, Unreadable> {
     let unreadable = |reason: String, is_too_large| Unreadable { reason, is_too_large };
     let stored = find(path).map_err(|e| unreadable(format!("its file: {e}"), false))?;
     let header = stored.header;
@@ -90,8 +92,9 @@ pub(super) fn read(path: &Path, most_bytes: u64) -> Result<(Volume, Orientation)
     let samples = read_samples(path, &header)
         .map_err(|e| unreadable(format!("{}: its file: {e}", header.name), false))?;
     let VolumeHeader { name, file_type, info, orientation } = header;
-    let (lattice, summary) = (info.lattice, info.summary);
+    let (coarse, lattice, summary) = (info.coarse(), info.lattice, info.summary);
     let volume = Volume::new(name, file_type, summary.anatomical, lattice, samples, summary.map);
+    let volume = Volume { coarse, ..volume };
     if volume.digest() != info.digest {
         let reason = format!(
             "{}: its file is damaged: the digest of its samples is another; remove it and upload it \
@@ -100,7 +103,8 @@ pub(super) fn read(path: &Path, most_bytes: u64) -> Result<(Volume, Orientation)
         );
         return Err(unreadable(reason, false));
     }
-    Ok((volume, orientation))
+    let source = MemorySource::new(Arc::new(volume), info.digest);
+    Ok((Arc::new(source), orientation))
 }
 
 fn read_samples(path: &Path, header: &VolumeHeader) -> io::Result<Samples> {

@@ -23,7 +23,7 @@ fn reader(count: Arc<AtomicUsize>) -> ReadFile {
         if most < 512 {
             return Err(fail("larger than the memory for volumes", true));
         }
-        Ok((volume(seed.into()), axes()))
+        Ok((Arc::new(MemorySource::of(volume(seed.into()))), axes()))
     })
 }
 
@@ -70,6 +70,10 @@ impl World {
     }
 }
 
+fn samples(open: &OpenVolume) -> &slabcast_common::volume::Samples {
+    &open.source.whole(open.level).expect("it is in memory").samples
+}
+
 fn header(name: &str, volume: &Volume) -> VolumeHeader {
     VolumeHeader {
         name: name.into(),
@@ -90,8 +94,8 @@ fn files_are_read_when_they_are_asked_for_and_once() {
     assert_eq!(names().collect::<Vec<_>>(), ["a.nrrd", "b.nii.gz"]);
     assert_eq!(world.reads.load(Relaxed), 0);
     let open = world.open("a.nrrd").expect("it is there");
-    assert_eq!(open.volume.digest(), volume(1).digest());
-    assert_eq!((open.served.name.as_str(), open.volume.name.as_str()), ("a.nrrd", "a.nrrd"));
+    assert_eq!(open.served.info.digest, volume(1).digest());
+    assert_eq!(open.served.name, "a.nrrd");
     assert!(world.open("a").is_ok(), "without its ending");
     let digest = VolumeChoice::Digest(open.served.info.digest);
     assert!(world.library.open(&digest, Viewer::own()).is_ok());
@@ -113,7 +117,7 @@ fn volume_that_was_unused_for_longest_makes_place_and_is_read_again() {
     assert_eq!(in_memory(), ["a.nrrd", "c.nrrd"]);
     let digest = VolumeChoice::Digest(volume(2).digest());
     let again = world.library.open(&digest, Viewer::own()).expect("its digest is known");
-    assert_eq!(again.volume.samples, volume(2).samples);
+    assert_eq!(*samples(&again), volume(2).samples);
     assert_eq!(in_memory(), ["b.nrrd", "c.nrrd"]);
 }
 
@@ -138,7 +142,7 @@ fn file_that_was_replaced_is_another_volume() {
     let path = world.dir.path().join("volumes/a.nrrd");
     std::fs::write(&path, [9, 9]).expect("a file");
     let second = world.open("a").expect("it is there");
-    assert_eq!(second.volume.digest(), volume(9).digest());
+    assert_eq!(second.served.info.digest, volume(9).digest());
     let e = world.library.open(&VolumeChoice::Digest(first), Viewer::own()).err();
     assert!(matches!(e, Some(VolumeError::NotFound(_))), "{e:?}");
     std::fs::remove_file(path).expect("it is there");
@@ -180,7 +184,10 @@ fn request_without_a_name_means_the_given_volume_or_the_only_one() {
     let e = world.library.open(&choice, Viewer::own()).err().expect("two");
     assert!(e.to_string().contains("2 volumes; name one (`slabcast volumes`"), "{e}");
     let given = Library::of(volume(4), axes());
-    assert_eq!(given.open(&choice, stranger()).expect("given").volume.digest(), volume(4).digest());
+    assert_eq!(
+        given.open(&choice, stranger()).expect("given").served.info.digest,
+        volume(4).digest()
+    );
     let world = World::new(&[], 8);
     let e = world.library.open(&choice, Viewer::own()).err().expect("none");
     assert!(e.to_string().contains("no volume yet; put one there"), "{e}");
@@ -223,13 +230,13 @@ fn uploads_go_on_where_they_were_and_outlive_the_master() {
     let done = Progress { received_bytes: 512, done: true };
     assert_eq!(put(300, 512).expect("the last"), done);
     assert_eq!((begin(), put(0, 10).expect("it is there")), (done, done));
-    assert_eq!(world.open("mine").expect("it is there").volume.samples, volume.samples);
+    assert_eq!(*samples(&world.open("mine").expect("it is there")), volume.samples);
 
     let World { dir, library, .. } = world;
     drop(library);
     let again = World::library(dir.path(), 8, Arc::default());
     let open = again.open(&VolumeChoice::Digest(digest), Viewer::own()).expect("it stayed");
-    assert_eq!((open.volume.digest(), open.served.name.as_str()), (digest, "mine"));
+    assert_eq!((open.served.info.digest, open.served.name.as_str()), (digest, "mine"));
     assert_eq!(open.served.info, volume.info(digest));
 }
 

@@ -246,7 +246,7 @@ impl Uploads {
 
     fn finish(&self, part: &mut Part, digest: Digest32) -> Result<Stored, VolumeError> {
         let name = &part.header.name;
-        if part.hasher.take().map(VolumeHasher::finish) != Some(digest) {
+        if part.hasher.take().map(|hasher| part.header.info.finish(hasher)) != Some(digest) {
             return Err(VolumeError::Damaged(format!(
                 "`{name}`: its samples have another digest than was announced; send it again"
             )));

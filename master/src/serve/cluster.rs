@@ -4,7 +4,7 @@ use super::connections::{Peer, State};
 use super::{GOODBYE, Responses};
 use crate::Handle;
 use crate::allowance::{self, Account};
-use crate::link::{BrickOrder, Broken, Caller, Damaged, WorkerLink, serve_until};
+use crate::link::{BrickOrder, Broken, Caller, Damaged, WorkerLink, bricks_of, serve_until};
 use slabcast_common::link::BRICK_BATCHES_IN_FLIGHT;
 use slabcast_common::message::{ToMaster, ToWorker};
 use slabcast_proto::cluster_v1::cluster_service_server::ClusterService;
@@ -14,6 +14,7 @@ use slabcast_proto::cluster_v1::{
 use slabcast_proto::convert::{self, BrickBatches, Down};
 use slabcast_proto::sealed::{self, Incoming, Seals, StreamError};
 use slabcast_proto::status::{Reason, invalid_field};
+use slabcast_volumes::BrickStore;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -214,8 +215,11 @@ async fn open_bricks(
     })
 }
 
-/// Sends what is ordered, a message at a time: as many encoded bricks are in memory as the channel
-/// and one message hold, however long the order is.
+/// Bricks of an order that are read together: a block has at most as many.
+const READ_BRICKS: usize = 512;
+
+/// Sends what is ordered, a message at a time. [`READ_BRICKS`] encoded bricks, and those in the
+/// channel, are in memory beside the store's, however long the order is.
 async fn send_bricks(
     mut orders: mpsc::UnboundedReceiver<BrickOrder>,
     account: &Mutex<Account>,
@@ -223,15 +227,24 @@ async fn send_bricks(
 ) {
     while let Some(order) = orders.recv().await {
         match order {
-            BrickOrder::Send { set, store, bricks } => {
-                let encoded = bricks.iter().filter_map(|id| store.encoded(*id));
-                for message in BrickBatches::new(&set, encoded) {
-                    // A place first, so that nothing counts as sent to a worker that reads nothing.
-                    let Ok(place) = out.reserve().await else { return };
-                    if let Some(bricks_response::Message::Batch(batch)) = &message.message {
-                        locked(account).sent_bricks(batch.bricks.len() as u64);
+            BrickOrder::Send { set, store, bricks, losses } => {
+                for (i, ids) in bricks.chunks(READ_BRICKS).enumerate() {
+                    let encoded = match bricks_of(&store, ids, BrickStore::try_encoded).await {
+                        Ok(encoded) => encoded,
+                        Err(reason) => {
+                            losses.report(&bricks[i * READ_BRICKS..], reason).await;
+                            break;
+                        }
+                    };
+                    for message in BrickBatches::new(&set, encoded) {
+                        // A place first, so that nothing counts as sent to a worker that reads
+                        // nothing.
+                        let Ok(place) = out.reserve().await else { return };
+                        if let Some(bricks_response::Message::Batch(batch)) = &message.message {
+                            locked(account).sent_bricks(batch.bricks.len() as u64);
+                        }
+                        place.send(message);
                     }
-                    place.send(message);
                 }
             }
             BrickOrder::Drop { set, bricks } => {

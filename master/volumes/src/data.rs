@@ -123,6 +123,9 @@ pub(crate) fn read_part(
     layout: &Layout,
     cap: ByteCap,
 ) -> Result<(Samples, ValueMap), Problem> {
+    if let Some(stream) = cap.beside.stream() {
+        stream.forget_place();
+    }
     let (end, need) = (part.end(), layout.bytes());
     let supply = match supply {
         Supply::Plain { have } if have < end => return Err(samples::truncated(end, have)),
@@ -195,6 +198,9 @@ pub(crate) fn read_files(
     let mut files =
         FileChain { folder: &folder, parts, storage, layout, share, notes, current: None };
     let layout = storage.decoded_layout(layout);
+    if let Some(stream) = cap.beside.stream() {
+        stream.forget_place();
+    }
     let read = match part {
         Some(part) => read_part(files, supply, part, &layout, cap),
         None => samples::read(&mut files, supply, &layout, cap),
@@ -241,6 +247,9 @@ fn open<'a>(
         };
         if skip > 0 {
             source.reader.seek(SeekFrom::Current(skip as i64)).map_err(io)?;
+        }
+        if let Some(stream) = source.cap.beside.stream() {
+            stream.set_place(source.reader.get_ref().file(), source.reader.stream_position());
         }
         return Ok((Box::new(source.reader), Supply::Plain { have: left - skip }));
     }

@@ -57,6 +57,11 @@ impl Problem {
         Problem { kind, field: field.into(), what: what.into(), remedy: remedy.into() }
     }
 
+    /// Returns the error with which a caller ends a long piece of work that it was asked to stop.
+    pub fn stopped() -> Problem {
+        Problem::new(OpenErrorKind::Unreadable, "work", "was stopped", "begin again")
+    }
+
     pub(crate) fn malformed(
         field: impl Into<String>,
         what: impl Into<String>,

@@ -95,6 +95,8 @@ fn volume(name: &str, dims: [u32; 3], title: &str) -> Option<Volume> {
     };
     let in_box = |q: [f64; 3], c: [f64; 3], h: [f64; 3]| (0..3).all(|a| (q[a] - c[a]).abs() < h[a]);
     match name {
+        // Not in the list: for tests of large volumes, of which it is a small one.
+        "cells" => u8s(&|i, j, k| crate::blocks::FormulaSource::sample(dims, [i, j, k])),
         "wall" => u8s(&|i, j, k| {
             let middle = |i: u32, n: u32| n / 4 <= i && i < n - n / 4;
             if middle(i, nx) && middle(j, ny) && middle(k, nz) { 200 } else { 0 }

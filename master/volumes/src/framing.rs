@@ -7,11 +7,13 @@
 //! 8x8x8 voxels count, the bricks of the renderer, and only if at least `DENSE` of their voxels
 //! are visible. Voxels of such cells count exactly.
 
+use crate::blocks::{BlockSource, MemorySource};
+use crate::error::Problem;
 use crate::store::relevance_table;
 use rayon::prelude::*;
 use slabcast_common::quality::{Classify, InvalidField, Quality};
 use slabcast_common::transfer::{Support, TransferFunction};
-use slabcast_common::volume::{Samples, Volume, VolumeInfo};
+use slabcast_common::volume::{Digest32, SampleKind, Samples, Volume, VolumeInfo};
 use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_scene::path::{CropBox, Framing, Orientation, ViewPath};
 use slabcast_scene::tween::Tween;
@@ -27,57 +29,88 @@ const DENSE: usize = 8;
 /// Returns index positions of visible voxels whose hull holds all visible voxels but lonely ones: of
 /// each layer k its hull, in ascending order. Visible are the codes of `support` within `crop`.
 pub fn outline(volume: &Volume, support: &Support, crop: Option<&CropBox>) -> Vec<[u32; 3]> {
-    let inside = |voxel: [u32; 3]| crop.is_none_or(|c| c.contains(&volume.lattice, voxel));
-    let dims = volume.lattice.dims.map(|n| n as usize);
-    match &volume.samples {
-        Samples::U8(v) => {
-            let seen = relevance_table(support, 256);
-            outline_of(v, dims, |c| seen[usize::from(c)], inside)
-        }
-        Samples::U16(v) => {
-            let seen = relevance_table(support, 65536);
-            outline_of(v, dims, |c| seen[usize::from(c)], inside)
-        }
-        Samples::F32(v) => outline_of(v, dims, |c| support.contains(f64::from(c)), inside),
-    }
+    let source = MemorySource::new(volume, Digest32::default());
+    outline_of(&source, 0, support, crop).expect("samples in memory can be read")
 }
 
-fn outline_of<T: Copy + Sync>(
-    codes: &[T],
-    dims: [usize; 3],
-    seen: impl Fn(T) -> bool + Sync,
-    inside: impl Fn([u32; 3]) -> bool + Sync,
-) -> Vec<[u32; 3]> {
-    let of = |dense: usize| -> Vec<[u32; 3]> {
-        let layers: Vec<Vec<[u32; 3]>> = (0..dims[2].div_ceil(EDGE))
-            .into_par_iter()
-            .map(|layer| Layer { codes, dims, seen: &seen, inside: &inside }.hulls(layer, dense))
-            .collect();
-        layers.concat()
+/// Returns [`outline`] of a level of a source, in index positions of the level.
+///
+/// # Errors
+/// A file can't be read, or is damaged.
+fn outline_of(
+    source: &dyn BlockSource,
+    level: usize,
+    support: &Support,
+    crop: Option<&CropBox>,
+) -> Result<Vec<[u32; 3]>, Problem> {
+    let info = &source.levels()[level];
+    let inside = |voxel: [u32; 3]| crop.is_none_or(|c| c.contains(&info.lattice, voxel));
+    let dims = info.lattice.dims;
+    let codes = match info.summary.kind {
+        SampleKind::U8 => 256,
+        SampleKind::U16 => 65536,
+        SampleKind::F32 => 0,
     };
-    let dense = of(DENSE);
+    let seen = relevance_table(support, codes);
+    let whole = source.whole(level);
+    let layer = |layer: u32, dense: usize| -> Result<Vec<[u32; 3]>, Problem> {
+        let slices = layer * EDGE as u32..((layer + 1) * EDGE as u32).min(dims[2]);
+        let read;
+        let (samples, first) = match whole {
+            Some(whole) => (&whole.samples, 0),
+            None => {
+                let end = [dims[0], dims[1], slices.end];
+                read = source.read_box(level, [0, 0, slices.start], end)?;
+                (&read, slices.start as usize)
+            }
+        };
+        let slices = slices.start as usize..slices.end as usize;
+        let dims = dims.map(|n| n as usize);
+        Ok(match samples {
+            Samples::U8(codes) => {
+                let seen = &|c: u8| seen[usize::from(c)];
+                Layer { codes, dims, first, seen, inside: &inside }.hulls(slices, dense)
+            }
+            Samples::U16(codes) => {
+                let seen = &|c: u16| seen[usize::from(c)];
+                Layer { codes, dims, first, seen, inside: &inside }.hulls(slices, dense)
+            }
+            Samples::F32(codes) => {
+                let seen = &|c: f32| support.contains(f64::from(c));
+                Layer { codes, dims, first, seen, inside: &inside }.hulls(slices, dense)
+            }
+        })
+    };
+    let of = |dense: usize| -> Result<Vec<[u32; 3]>, Problem> {
+        let layers = (0..dims[2].div_ceil(EDGE as u32)).into_par_iter();
+        let layers: Result<Vec<_>, _> = layers.map(|n| layer(n, dense)).collect();
+        Ok(layers?.concat())
+    };
+    let dense = of(DENSE)?;
     // All that there is may be a few voxels.
-    if dense.is_empty() { of(1) } else { dense }
+    if dense.is_empty() { of(1) } else { Ok(dense) }
 }
 
-/// A volume's codes, of which layers of cells are looked at.
+/// Codes of slices of a volume, of which layers of cells are looked at.
 struct Layer<'a, T, S, I> {
     codes: &'a [T],
+    /// Samples of the volume along each axis.
     dims: [usize; 3],
+    /// The first slice that `codes` holds.
+    first: usize,
     seen: &'a S,
     inside: &'a I,
 }
 
 impl<T: Copy, S: Fn(T) -> bool, I: Fn([u32; 3]) -> bool> Layer<'_, T, S, I> {
     /// The hulls of the slices of one layer of cells.
-    fn hulls(&self, layer: usize, dense: usize) -> Vec<[u32; 3]> {
-        let [nx, ny, nz] = self.dims;
-        let slices = layer * EDGE..((layer + 1) * EDGE).min(nz);
+    fn hulls(&self, slices: std::ops::Range<usize>, dense: usize) -> Vec<[u32; 3]> {
+        let [nx, ny, _] = self.dims;
         let cells = [nx.div_ceil(EDGE), ny.div_ceil(EDGE)];
         let mut counts = vec![0usize; cells[0] * cells[1]];
         for z in slices.clone() {
             for y in 0..ny {
-                let row = &self.codes[(z * ny + y) * nx..][..nx];
+                let row = &self.codes[((z - self.first) * ny + y) * nx..][..nx];
                 let counts = &mut counts[y / EDGE * cells[0]..][..cells[0]];
                 for (cell, run) in row.chunks(EDGE).enumerate() {
                     counts[cell] += run.iter().filter(|&&c| (self.seen)(c)).count();
@@ -90,7 +123,7 @@ impl<T: Copy, S: Fn(T) -> bool, I: Fn([u32; 3]) -> bool> Layer<'_, T, S, I> {
         let mut points = Vec::new();
         for z in slices {
             let rows = (0..ny).filter_map(|y| {
-                let row = &self.codes[(z * ny + y) * nx..][..nx];
+                let row = &self.codes[((z - self.first) * ny + y) * nx..][..nx];
                 let counts = &counts[y / EDGE * cells[0]..][..cells[0]];
                 let counts_here = |x: &usize| {
                     counts[x / EDGE] >= dense
@@ -141,14 +174,64 @@ pub fn framing(
     transfer: &TransferFunction,
     orientation: Orientation,
 ) -> Result<Option<Framing>, InvalidField> {
+    let source = MemorySource::new(volume, info.digest);
+    framing_of(path, &source, transfer, orientation).map_err(|e| match e {
+        FramingError::Field(field) => field,
+        FramingError::File(problem) => unreachable!("samples in memory can be read: {problem}"),
+    })
+}
+
+/// Samples of the level at which a path is framed, at most. Larger volumes are framed to a coarser
+/// level: half a sample of it is a thousandth of the picture.
+const MOST_SAMPLES: u64 = 1 << 28;
+
+/// Why a path can't be framed.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum FramingError {
+    /// A field of the path or function doesn't fit the volume.
+    #[error(transparent)]
+    Field(#[from] InvalidField),
+    /// The volume's file can't be read.
+    #[error(transparent)]
+    File(#[from] Problem),
+}
+
+/// Returns the framing of a path like [`framing`], to a volume that is read in boxes. Positions are
+/// those of its finest level.
+///
+/// # Errors
+/// The field of the path or function that doesn't fit the volume; or a file that can't be read.
+pub fn framing_of(
+    path: &ViewPath,
+    source: &dyn BlockSource,
+    transfer: &TransferFunction,
+    orientation: Orientation,
+) -> Result<Option<Framing>, FramingError> {
     if !path.wants_framing() {
         return Ok(None);
     }
-    let tween = Tween::from_path(path, &info.summary)?;
+    let levels = source.levels();
+    let finest = &levels[0];
+    let tween = Tween::from_path(path, &finest.summary)?;
     let quality = Quality { classify: Classify::Before, ..Quality::before() };
-    let needs = BrickNeeds::for_path(path, transfer, tween.as_ref(), info, &quality)?;
-    let points = outline(volume, &needs.support, needs.crop.as_ref());
-    path.framing(&points, &info.lattice, orientation)
+    let needs = BrickNeeds::for_path(path, transfer, tween.as_ref(), finest, &quality)?;
+    let is_small = |level: &VolumeInfo| level.lattice.len() as u64 <= MOST_SAMPLES;
+    let level = levels.iter().position(is_small).unwrap_or(levels.len() - 1);
+    let to_level = finest.lattice.to_centre_of(&levels[level].lattice);
+    let needs = needs.at_centre(to_level);
+    let points = outline_of(source, level, &needs.support, needs.crop.as_ref())?;
+    let points: Vec<_> = points.into_iter().map(|p| in_finest(levels, level, p)).collect();
+    Ok(path.framing(&points, &finest.lattice, orientation)?)
+}
+
+/// Returns the sample of the finest level nearest to the centre of one of another level.
+fn in_finest(levels: &[VolumeInfo], level: usize, point: [u32; 3]) -> [u32; 3] {
+    let (finest, coarse) = (&levels[0].lattice, &levels[level].lattice);
+    std::array::from_fn(|a| {
+        let ratio = (coarse.spacing()[a] / finest.spacing()[a]).round().max(1.0);
+        let at = f64::from(point[a]) * ratio + (ratio - 1.0) * 0.5;
+        (at as u32).min(finest.dims[a] - 1)
+    })
 }
 
 #[cfg(test)]

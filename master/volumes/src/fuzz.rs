@@ -225,14 +225,8 @@ fn survive(
         return;
     }
     let support = Support { intervals: vec![(0.0, f64::MAX)], nan: true };
-    let wanted = BrickNeeds {
-        support,
-        normals: true,
-        gradients: true,
-        halo: 0,
-        coefficients: false,
-        crop: None,
-    };
+    let wanted =
+        BrickNeeds { support, normals: true, gradients: true, halo: 0, ..BrickNeeds::default() };
     // Resets the peak of resident memory, where the system allows it.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
     let before_kib = resident_kib("VmHWM:");

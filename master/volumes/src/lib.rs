@@ -34,8 +34,8 @@
 //! - Zarr arrays of versions 2 and 3, and OME-Zarr pyramids (feature `zarr`)
 //! - volumes by formula: `formula:NAME`
 //!
-//! [`write`](mod@write) writes NRRD and NIfTI-1. Not read: colours, time series, and volumes
-//! larger than memory.
+//! [`write`](mod@write) writes NRRD and NIfTI-1. [`blocks`] reads and writes volumes larger than memory.
+//! Not read: colours and time series.
 //!
 //! Input files are not trusted. A size in a header takes no memory before the bytes were seen;
 //! nothing outside the header's folder is read; every refusal is one line that names the file, the
@@ -44,6 +44,8 @@
 //! This crate has no network, no clock, and knows neither tasks, views nor colours. It does use
 //! threads, since cutting bricks is work for all cores.
 
+pub mod auto_level;
+pub mod blocks;
 mod data;
 #[cfg(feature = "dicom")]
 pub mod dicom;
@@ -74,7 +76,8 @@ mod reads;
 mod samples;
 mod sketch;
 mod source;
-mod store;
+pub mod store;
+mod stream;
 mod tiff_stack;
 mod units;
 mod unpack;

@@ -15,9 +15,9 @@ use crate::error::{OpenErrorKind, Problem};
 use crate::numbers::Beside;
 
 /// Bytes of samples that any file may become, however small it is.
-const ANY_FILE_BYTES: u64 = 1 << 30;
+pub(crate) const ANY_FILE_BYTES: u64 = 1 << 30;
 /// Bytes of samples for each byte of a file, beyond [`ANY_FILE_BYTES`].
-const FILE_RATIO: u64 = 64;
+pub(crate) const FILE_RATIO: u64 = 64;
 /// Samples of fewer bytes fit everywhere; the system is not asked for its memory.
 const SMALL_BYTES: u64 = 64 << 20;
 /// Free memory to assume where the system does not tell.

@@ -62,7 +62,7 @@ pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volu
             data::read_files(folder, names, (source.cap, &source.notes), &storage, layout)?
         }
     };
-    Ok(Volume::new(name, layout.number.name(), anatomical, lattice, samples, map))
+    Ok(crate::stream::volume(name, layout.number.name(), anatomical, lattice, samples, map))
 }
 
 /// The header's fields: line number, key and value by key in lower case.

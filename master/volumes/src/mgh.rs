@@ -84,7 +84,7 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
         Problem::malformed("delta, Mdc", e, "correct them with mri_convert, or get the file again")
     })?;
     let (samples, map, _) = file.samples(&layout, part.as_ref())?;
-    Ok(Volume::new(name, number.name(), true, lattice, samples, map))
+    Ok(crate::stream::volume(name, number.name(), true, lattice, samples, map))
 }
 
 #[cfg(test)]

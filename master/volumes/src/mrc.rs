@@ -165,7 +165,7 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
     if after > 0 {
         notes.add(format!("{after} bytes after the samples were not read"));
     }
-    Ok(Volume::new(name, kind, false, lattice, samples, map))
+    Ok(crate::stream::volume(name, kind, false, lattice, samples, map))
 }
 
 /// Returns the type of mode 0, which is signed since 2014 and was unsigned in IMOD before.

@@ -32,6 +32,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Problem> {
     let (source_pick, said) = (source.pick, source.notes.clone());
     let (len, cap, beside) = (source.len, source.cap.clone(), source.cap.beside);
+    let file = if gzip { None } else { source.reader.get_ref().file() };
     let mut reader: Box<dyn Read + Send> = match gzip {
         true => Box::new(Members::new(Packing::Gzip, source.reader, source.notes.clone())),
         false => Box::new(source.reader),
@@ -68,6 +69,9 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
         true => Supply::deflate("gzip", len),
         false => Supply::Plain { have: len.saturating_sub(size as u64 + skip) },
     };
+    if let Some(stream) = cap.beside.stream() {
+        stream.set_place(file, Ok(size as u64 + skip));
+    }
     let (samples, stored) = match &part {
         Some(part) => data::read_part(reader, supply, part, &layout, cap)?,
         None => samples::read(reader, supply, &layout, cap)?,
@@ -383,7 +387,8 @@ impl Header {
         if let Some(rescale) = self.rescale() {
             beside.rescale(rescale);
         }
-        let volume = Volume::new(name, layout.number.name(), anatomical, lattice, samples, map);
+        let volume =
+            crate::stream::volume(name, layout.number.name(), anatomical, lattice, samples, map);
         let (lo, hi) = volume.summary.range();
         if !(lo.is_finite() && hi.is_finite() && map.scale.is_normal()) {
             return Err(Problem::malformed(

@@ -51,7 +51,7 @@ pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volu
     };
     let (samples, map) = samples?;
     let file_type = header.layout.number.name();
-    Ok(Volume::new(name, file_type, header.anatomical, header.lattice, samples, map))
+    Ok(crate::stream::volume(name, file_type, header.anatomical, header.lattice, samples, map))
 }
 
 /// The header's fields: line number and value by name.

@@ -6,6 +6,7 @@
 //! are not exact. Otherwise a note says by how much they were rounded.
 
 use crate::samples::Number;
+use crate::stream::NumberStream;
 use slabcast_common::volume::ValueMap;
 use std::sync::{Arc, Mutex};
 
@@ -110,6 +111,8 @@ pub struct Beside {
     /// Whether the file's own numbers are kept where codes (u16 or f32) would round them.
     keep: bool,
     left: Arc<Mutex<Left>>,
+    /// Takes the numbers in place of a list of samples.
+    stream: Option<NumberStream>,
 }
 
 #[derive(Debug, Default)]
@@ -121,7 +124,18 @@ struct Left {
 impl Beside {
     /// Returns a fresh one, which keeps numbers or notes their rounding.
     pub(crate) fn new(keep: bool) -> Beside {
-        Beside { keep, left: Arc::default() }
+        Beside { keep, ..Beside::default() }
+    }
+
+    /// Returns a fresh one for a reader whose numbers go to a stream.
+    #[cfg(feature = "zarr")]
+    pub(crate) fn streaming(stream: NumberStream) -> Beside {
+        Beside { stream: Some(stream), ..Beside::default() }
+    }
+
+    /// Returns the stream that takes the numbers, if one does.
+    pub(crate) fn stream(&self) -> Option<&NumberStream> {
+        self.stream.as_ref()
     }
 
     pub(crate) fn keeps(&self) -> bool {

@@ -171,7 +171,7 @@ pub(crate) fn read(
         skip_field: "--skip",
     };
     let (samples, map) = data::read(source, len, &storage, &layout, None)?;
-    Ok(Volume::new(name, number.name(), false, lattice, samples, map))
+    Ok(crate::stream::volume(name, number.name(), false, lattice, samples, map))
 }
 
 fn format_dims([x, y, z]: [u64; 3]) -> String {

@@ -253,9 +253,18 @@ pub(crate) fn read(
         _ => {}
     }
     let (Supply::Plain { have: stored } | Supply::Encoded { bytes: stored, .. }) = supply;
-    cap.check(need, stored, "size")?;
+    let streamed = cap.beside.stream().cloned();
+    if streamed.is_none() {
+        cap.check(need, stored, "size")?;
+    }
     let bytes = ByteReader { reader, supply, need, received: 0 };
     let mut data = NumberReader { bytes, size: layout.number.bytes() as usize };
+    if let Some(stream) = streamed {
+        if let Some(mut sender) = stream.begin(layout)? {
+            data.for_each_chunk(|bytes| sender.send(bytes))?;
+        }
+        return Ok((Samples::U8(Vec::new()), ValueMap::IDENTITY));
+    }
     let big = layout.endian == Endian::Big;
     macro_rules! words {
         ($t:ty) => {

@@ -13,8 +13,20 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 /// Reader under a [`Source`]: a file, or bytes of a test.
-pub(crate) trait Stream: Read + Seek + Send {}
-impl<T: Read + Seek + Send> Stream for T {}
+pub(crate) trait Stream: Read + Seek + Send {
+    /// Returns the file, for reading at places of its own; `None` for anything else.
+    fn file(&self) -> Option<File> {
+        None
+    }
+}
+
+impl Stream for File {
+    fn file(&self) -> Option<File> {
+        self.try_clone().ok()
+    }
+}
+
+impl Stream for std::io::Cursor<Vec<u8>> {}
 
 /// An open file with its length, or the bytes of a test.
 pub(crate) struct Source {

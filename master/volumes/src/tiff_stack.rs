@@ -240,7 +240,7 @@ fn finish(
     let lattice = Lattice::from_spacing(layout.dims, spacing.unwrap_or([1.0; 3]));
     lattice.check().map_err(|e| Problem::malformed("spacing", e, "give it with --spacing"))?;
     let (samples, map) = samples::read(&mut samples, supply, &layout, cap)?;
-    Ok(Volume::new(name, page.kind(), false, lattice, samples, map))
+    Ok(crate::stream::volume(name, page.kind(), false, lattice, samples, map))
 }
 
 fn too_many(count: u64) -> Problem {

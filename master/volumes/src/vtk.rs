@@ -170,7 +170,7 @@ pub(crate) fn read(
         let samples = Samples::U8(bytes);
         return Ok(Volume::new(name, "uint8", false, lattice, samples, ValueMap::IDENTITY));
     }
-    Ok(Volume::new(name, number.name(), false, lattice, samples, map))
+    Ok(crate::stream::volume(name, number.name(), false, lattice, samples, map))
 }
 
 fn bad(field: &str, what: impl Into<String>) -> Problem {

@@ -26,8 +26,8 @@ pub(crate) fn compact_integers<T: Wide + Ord + Into<i128>>(
     let max: i128 = (*all().max().expect("a volume has a sample")).into();
     // Can't overflow: 64-bit integers differ by less than 2^64.
     let span = max - min;
-    if span <= i128::from(u16::MAX) {
-        let map = ValueMap { scale: 1.0, offset: min as f64 };
+    let map = integer_map(min, max);
+    if fits_u16(min, max) {
         // Values are f64.
         const EXACT: i128 = 1 << 53;
         let exact = min >= -EXACT && max <= EXACT;
@@ -39,16 +39,32 @@ pub(crate) fn compact_integers<T: Wide + Ord + Into<i128>>(
         beside.rounded::<T>((min.abs().max(max.abs()) as f64 * f64::EPSILON / 2.0).max(1.0));
         return Ok((Samples::U16(convert_beside(pieces, map, beside, code)?), map));
     }
-    let map = ValueMap { scale: span as f64, offset: min as f64 };
     let mut most = 0.0f64;
     let codes = convert_beside(pieces, map, beside, |v| {
         let v: i128 = v.into();
-        let code = ((v - min) as f64 / span as f64) as f32;
+        let code = unit_code(v, min, span);
         most = most.max((map.value(code.into()) - v as f64).abs());
         code
     })?;
     beside.rounded::<T>(most);
     Ok((Samples::F32(codes), map))
+}
+
+/// Returns whether codes of 16 bits hold integers from `min` to `max`.
+pub(crate) fn fits_u16(min: i128, max: i128) -> bool {
+    max - min <= i128::from(u16::MAX)
+}
+
+/// Returns the map from codes to integers from `min` to `max`.
+pub(crate) fn integer_map(min: i128, max: i128) -> ValueMap {
+    let scale = if fits_u16(min, max) { 1.0 } else { (max - min) as f64 };
+    ValueMap { scale, offset: min as f64 }
+}
+
+/// Returns the code, 0 to 1, of an integer whose range is too wide for 16 bits.
+#[inline]
+pub(crate) fn unit_code(v: i128, min: i128, span: i128) -> f32 {
+    ((v - min) as f64 / span as f64) as f32
 }
 
 const F32_MAX: f64 = f32::MAX as f64;
@@ -61,20 +77,41 @@ const FILLER_RATIO: f64 = 1e9;
 /// Least number of values that tell a filler from a value like others.
 const FILLER_VALUES: usize = 64;
 
-/// Returns the size above which values stand for none; `None` without such. They are one value, with
-/// either sign.
-fn filler_limit(all: impl Iterator<Item = f64>) -> Option<f64> {
-    let (mut first, mut second, mut count) = (0.0f64, 0.0f64, 0);
-    for size in all.map(f64::abs).filter(|size| size.is_finite()) {
-        count += 1;
-        if size > first {
-            (first, second) = (size, first);
-        } else if size > second && size < first {
-            second = size;
+/// Looks for a filler among values.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Fillers {
+    /// Size of the largest value.
+    pub(crate) first: f64,
+    /// Size of the largest that is smaller.
+    second: f64,
+    count: usize,
+}
+
+impl Fillers {
+    /// Looks at the size of a finite value.
+    #[inline]
+    pub(crate) fn add(&mut self, size: f64) {
+        self.count += 1;
+        if size > self.first {
+            (self.first, self.second) = (size, self.first);
+        } else if size > self.second && size < self.first {
+            self.second = size;
         }
     }
-    let is_filler = first >= FILLER_MIN && second > 0.0 && first / FILLER_RATIO > second;
-    (is_filler && count >= FILLER_VALUES).then_some(second)
+
+    /// Returns the size above which values stand for none; `None` without such. They are one value,
+    /// with either sign.
+    pub(crate) fn limit(&self) -> Option<f64> {
+        let &Fillers { first, second, count } = self;
+        let is_filler = first >= FILLER_MIN && second > 0.0 && first / FILLER_RATIO > second;
+        (is_filler && count >= FILLER_VALUES).then_some(second)
+    }
+}
+
+fn filler_limit(all: impl Iterator<Item = f64>) -> Option<f64> {
+    let mut found = Fillers::default();
+    all.map(f64::abs).filter(|size| size.is_finite()).for_each(|size| found.add(size));
+    found.limit()
 }
 
 /// Replaces fillers in f32 samples by NaN. Notes them, or keeps the samples.
@@ -116,7 +153,24 @@ pub(crate) fn compact_doubles(
     let inside = all().filter(|v| v.abs() <= limit);
     let (lo, hi) =
         inside.fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), v| (lo.min(v), hi.max(v)));
-    let map = if lo > hi || f32_keeps_range(lo, hi) {
+    let map = double_map(lo, hi);
+    let mut most = 0.0f64;
+    let codes = convert_beside(pieces, map, beside, |v| {
+        if v.is_finite() && v.abs() > limit {
+            return f32::NAN;
+        }
+        let code = double_code(v, map);
+        // The difference of infinities is NaN, which `max` leaves out.
+        most = most.max((map.value(code.into()) - v).abs());
+        code
+    })?;
+    beside.rounded::<f64>(most);
+    Ok((Samples::F32(codes), map))
+}
+
+/// Returns the map from f32 codes to doubles from `lo` to `hi`; `lo` is above `hi` if there are none.
+pub(crate) fn double_map(lo: f64, hi: f64) -> ValueMap {
+    if lo > hi || f32_keeps_range(lo, hi) {
         ValueMap::IDENTITY
     } else if hi == lo {
         ValueMap { scale: 1.0, offset: lo }
@@ -125,19 +179,13 @@ pub(crate) fn compact_doubles(
     } else {
         // The span overflows f64: codes are -1..1 around the middle.
         ValueMap { scale: hi / 2.0 - lo / 2.0, offset: hi / 2.0 + lo / 2.0 }
-    };
-    let mut most = 0.0f64;
-    let codes = convert_beside(pieces, map, beside, |v| {
-        if v.is_finite() && v.abs() > limit {
-            return f32::NAN;
-        }
-        let code = ((v - map.offset) / map.scale) as f32;
-        // The difference of infinities is NaN, which `max` leaves out.
-        most = most.max((map.value(code.into()) - v).abs());
-        code
-    })?;
-    beside.rounded::<f64>(most);
-    Ok((Samples::F32(codes), map))
+    }
+}
+
+/// Returns the code of a double.
+#[inline]
+pub(crate) fn double_code(v: f64, map: ValueMap) -> f32 {
+    ((v - map.offset) / map.scale) as f32
 }
 
 /// Returns whether f32 can hold values from `lo` to `hi` directly: none overflows, and rounding

@@ -3,6 +3,7 @@
 use super::WireError;
 use glam::{DMat3, DVec3};
 use slabcast_common::brick::{BRICK_EDGE, MAX_BRICKS};
+use slabcast_common::level::MAX_LEVEL;
 use slabcast_common::view::MAX_EDGE;
 use slabcast_common::volume::{Lattice, SampleKind, ValueMap, ValueSummary};
 
@@ -68,6 +69,30 @@ pub(super) fn check_lattice(lattice: &Lattice, dims: &str, fields: &str) -> Resu
     }
     // The count of samples, and with it whatever counts them, fits: 2^27 bricks of 512.
     lattice.check().map_err(|problem| WireError::value(fields, problem))
+}
+
+/// Reads the length of a vox of level 0 of a volume whose `level` has the checked `lattice`.
+pub(super) fn finest_vox_from_wire(
+    lattice: &Lattice,
+    level: u32,
+    finest_vox: f64,
+) -> Result<f64, WireError> {
+    if level > MAX_LEVEL {
+        return Err(WireError::value(
+            "level",
+            format!("{level}; a volume has at most {MAX_LEVEL}"),
+        ));
+    }
+    if level == 0 {
+        return Ok(lattice.vox());
+    }
+    // A level is coarser than level 0, but for the rounding of what a file says.
+    let coarseness = lattice.vox() / finest_vox;
+    if !(0.999..=1e12).contains(&coarseness) {
+        let problem = "is not the smallest spacing of a finer level of this volume";
+        return Err(WireError::value("finest_vox", problem));
+    }
+    Ok(finest_vox)
 }
 
 /// Value range and histogram of a volume, as `Volume` has them in both packages of the wire.

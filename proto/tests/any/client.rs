@@ -5,6 +5,7 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use slabcast_common::ids::WorkerId;
 use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::level::{LevelChoice, LevelStats};
 use slabcast_common::quality::{Borders, Keep, Schedule, Sums, Work};
 use slabcast_common::stats::*;
 use slabcast_common::volume::{Digest32, SampleKind, ValueCore, ValueSummary, VolumeInfo};
@@ -182,17 +183,23 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
     ];
     let sums = prop_oneof![Just(Sums::Auto), Just(Sums::I32), Just(Sums::F32)];
     (
-        (("[A-Za-z0-9-]{1,60}", volume_choice()), path, transfer, quality(sums)),
+        (
+            ("[A-Za-z0-9-]{1,60}", volume_choice().boxed(), level().boxed()),
+            path,
+            transfer,
+            quality(sums),
+        ),
         (work, format(), background, any::<[bool; 2]>()),
     )
         .prop_map(
             |(
-                ((client_key, volume), path, transfer, quality),
+                ((client_key, volume, level), path, transfer, quality),
                 (work, format, background, [trace, hash]),
             )| {
                 PathRequest {
                     client_key,
                     volume,
+                    level,
                     path,
                     transfer,
                     quality,
@@ -204,6 +211,10 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
                 }
             },
         )
+}
+
+fn level() -> impl Strategy<Value = LevelChoice> {
+    prop_oneof![Just(LevelChoice::Auto), (0u32..=63).prop_map(LevelChoice::At)]
 }
 
 fn volume_choice() -> impl Strategy<Value = VolumeChoice> {
@@ -430,6 +441,12 @@ pub fn stats() -> impl Strategy<Value = FrameStats> {
                 poisoned,
                 critical_path,
                 rehearsed,
+                level: rehearsed.then_some(LevelStats {
+                    level: pixels_version % 64,
+                    pixels_per_vox: (n[8] % 2 == 0).then_some(t[0]),
+                    samples: n[0],
+                    finest_samples: n[1],
+                }),
             }
         })
 }

@@ -113,10 +113,9 @@ pub fn info() -> impl Strategy<Value = VolumeInfo> {
             anatomical: false,
             core: None,
         });
-    (any::<[u8; 32]>(), lattice, summary).prop_map(|(digest, lattice, summary)| VolumeInfo {
-        digest: Digest32(digest),
-        lattice,
-        summary,
+    (any::<[u8; 32]>(), lattice, summary, 0u32..4).prop_map(|(digest, lattice, summary, level)| {
+        let finest_vox = lattice.vox() / f64::from(1 << level);
+        VolumeInfo { digest: Digest32(digest), lattice, summary, level, finest_vox }
     })
 }
 

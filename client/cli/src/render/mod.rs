@@ -26,6 +26,7 @@ use slabcast_session::record::{self, Recording};
 use slabcast_session::request::{RenderRequest, SceneArgs, UsualTurn, WorkArgs};
 use slabcast_session::source::{Cancel, Source, Update};
 use slabcast_session::{remote, runtime, signals, volume};
+use slabcast_volumes::blocks::{BlockSource, MemorySource};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -174,6 +175,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     }
     let crew = WorkerGroup::new(args.workers.unwrap_or(1), args.threads)?;
     let mut request = args.scene.request_with_turn(args.work.work()?, usual_turn(args)?)?;
+    request.level = args.input.level();
     let mut notes = Vec::new();
     if let Some(like) = &args.like {
         let other = volume::open(like)?.info(Digest32::default());
@@ -229,18 +231,23 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         (Some(file), None) => {
             let mut run = run;
             run.progress.phase(&format!("reading {}", file.display()));
-            let volume = Arc::new(args.input.open(file)?);
-            let orientation = args.scene.view.axes.for_volume(&volume)?;
+            let opened = args.input.open_source(file)?;
+            run.request.level = args.input.level_of(&*opened.source);
+            let orientation = args.scene.view.axes.for_info(opened.info())?;
             let tried = if run.request.target.is_empty() {
                 None
             } else {
+                let volume = opened.whole("--error, --fps and --like")?;
                 choose_here(&mut run, &volume, orientation, crew, &runtime, args.quiet)?
             };
             match args.show {
                 None | Some(DebugView::Owner) => {
-                    runtime.block_on(embedded(run, volume, orientation, crew, tried))
+                    runtime.block_on(embedded(run, opened.source, orientation, crew, tried))
                 }
-                Some(show) => runtime.block_on(drawn(run, volume, orientation, show, crew)),
+                Some(show) => {
+                    let volume = opened.whole("--show")?;
+                    runtime.block_on(drawn(run, volume, orientation, show, crew))
+                }
             }
         }
         (_, Some(master)) => {
@@ -346,7 +353,7 @@ pub(crate) fn again(
     let runtime = runtime::start_embedded()?;
     let result = runtime.block_on(embedded(
         run,
-        Arc::new(volume),
+        Arc::new(MemorySource::of(volume)),
         orientation,
         WorkerGroup::new(1, None)?,
         None,
@@ -357,23 +364,22 @@ pub(crate) fn again(
 
 async fn embedded(
     mut run: Run,
-    volume: Arc<Volume>,
+    source: Arc<dyn BlockSource>,
     orientation: Orientation,
     crew: WorkerGroup,
     tried: Option<Cluster>,
 ) -> Result<(), Fail> {
-    let name = volume.name.clone();
-    if !volume.anatomical && !run.stands && !name.starts_with("formula:") {
+    let (name, anatomical) = (source.name().to_owned(), source.levels()[0].summary.anatomical);
+    if !anatomical && !run.stands && !name.starts_with("formula:") {
         run.notes.push(format!(
             "{name} does not say what is up: {} is taken, with {} in front; see --up and --front",
             orientation.up, orientation.front
         ));
     }
-    let anatomical = volume.anatomical;
     let (recorder, recording) = run.record.take().map(|p| record::start(&p)).transpose()?.unzip();
     let mut cluster = match tried {
         Some(cluster) => cluster,
-        None => Cluster::start(volume, orientation, crew, recorder)?,
+        None => Cluster::of(source, orientation, crew, recorder)?,
     };
     let handle = cluster.handle();
     let info = cluster.volume().info.clone();

@@ -3,6 +3,7 @@
 use super::debug_views::{self, DebugView};
 use super::frame_check::FrameCheck;
 use super::trace::TraceFile;
+use slabcast_common::level::{LevelChoice, LevelStats};
 use slabcast_common::view::CameraProjection;
 use slabcast_common::volume::VolumeInfo;
 use slabcast_scene::path::{Orientation, ViewPath};
@@ -65,6 +66,19 @@ fn where_the_eye_is(path: &ViewPath, info: &VolumeInfo, o: Orientation) -> Optio
     } else {
         (fov > WIDE).then(|| format!("{place}; what is near it looks large"))
     }
+}
+
+/// Says which level `--level auto` became.
+fn drawn_level(level: &LevelStats) -> String {
+    let LevelStats { level, samples, finest_samples, .. } = level;
+    if *level == 0 {
+        return "--level auto: all detail is drawn, since samples cover a pixel or more".into();
+    }
+    let share = *finest_samples as f64 / (*samples).max(1) as f64;
+    format!(
+        "--level auto: level {level} is drawn, 1 of {share:.0} samples; `slabcast lab error --level \
+         {level}` says what it costs"
+    )
 }
 
 impl Run {
@@ -193,6 +207,11 @@ impl Run {
                                 continue;
                             };
                             check.look(&frame, &facts, info, &request);
+                            if let Some(level) = facts.level.filter(|_| begins && tell)
+                                && request.level == LevelChoice::Auto
+                            {
+                                progress::note(&drawn_level(&level));
+                            }
                             stats.put(&format!("{stats_json}\n"))?;
                             trace.put(&trace_json)?;
                             progress.step(step.clone());

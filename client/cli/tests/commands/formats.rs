@@ -122,6 +122,28 @@ fn convert_keeps_voxels_values_and_orientation() {
     assert_eq!((&a["digest"], &a["values"]["max"]), (&b["digest"], &serde_json::json!(768.0)));
 }
 
+/// OME-Zarr has all levels, and level 0 is the file.
+#[test]
+fn convert_writes_a_pyramid_whose_finest_level_is_the_volume() {
+    let dir = tempfile::tempdir().unwrap();
+    let sample = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../samples/mni152_t1.nii.gz");
+    let sample = sample.to_string_lossy();
+    let want = info(dir.path(), Path::new(&*sample), &[]);
+    let said = good(dir.path(), &["convert", &sample, "x.ome.zarr"]);
+    assert!(said.starts_with("x.ome.zarr: ") && said.contains(" levels"), "{said}");
+    let found = info(dir.path(), Path::new("x.ome.zarr"), &[]);
+    for key in ["digest", "file_type", "anatomical", "steps", "origin", "values"] {
+        assert_eq!(found[key], want[key], "{key}");
+    }
+    assert_eq!(found["levels"][0]["dims"], want["dims"]);
+    let text = good(dir.path(), &["info", "x.ome.zarr"]);
+    assert!(text.contains("levels       0: ") && text.contains(" 1: "), "{text}");
+    let again = run(dir.path(), &["convert", &sample, "x.ome.zarr"]);
+    assert_eq!(again.status.code(), Some(1));
+    good(dir.path(), &["convert", &sample, "x.ome.zarr", "--force", "-q"]);
+    assert_eq!(crate::program::names(dir.path()), ["x.ome.zarr"], "nothing else is left");
+}
+
 #[test]
 fn dataset_flag_takes_one_of_several_arrays() {
     let dir = tempfile::tempdir().unwrap();

@@ -339,6 +339,10 @@ fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
         (vec!["convert", "good.nrrd", "x.png"], &["OUT", "x.png", ".nii.gz"]),
         (vec!["convert", "good.nrrd", "good.nrrd"], &["OUT", "is the volume itself"]),
         (vec!["convert", "good.nrrd", "x.nii", "--encoding", "gzip"], &["--encoding", ".nii.gz"]),
+        (
+            vec!["convert", "good.nrrd", "x.ome.zarr", "--encoding", "raw"],
+            &["--encoding", "OME-Zarr"],
+        ),
         (with(&["--dims", "3x3"]), &["--dims", "256x256x128"]),
         (with(&["--dims", "0x3x3"]), &["--dims", "from 1"]),
         (with(&["--type", "colour"]), &["--type", "uint8, int8"]),

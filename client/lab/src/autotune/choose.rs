@@ -13,11 +13,13 @@ use super::local_bed::{Clock, LocalBed};
 use super::setting::{Setting, fraction};
 use super::test_bed::{TestBed, check_not_stopped};
 use super::trial::{Deviation, Trial};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_scene::path::Orientation;
 use slabcast_session::direct::Cut;
 use slabcast_session::fail::Fail;
+use slabcast_session::path_scenes::coarsest_level;
 use slabcast_session::progress::{self, Progress};
 use slabcast_session::quality_target::QualityTarget;
 use slabcast_session::request::RenderRequest;
@@ -327,10 +329,48 @@ pub(crate) fn settle(
     if request.target.is_empty() {
         return Ok(());
     }
-    let trial = trial(volume, info, request, orientation, threads)?;
-    let clock = Clock::Plain(Cut { tile: 64, ..Cut::on(threads) });
-    choose(&mut LocalBed::new(trial, clock), &request.target.clone(), false)?.settle(request);
+    let coarsest = coarsest_level(volume, info, request, orientation)?;
+    let chosen = at_level_that_keeps_target(request, Some(coarsest), |request| {
+        let trial = trial(volume, info, request, orientation, threads)?;
+        let clock = Clock::Plain(Cut { tile: 64, ..Cut::on(threads) });
+        choose(&mut LocalBed::new(trial, clock), &request.target.clone(), false)
+    })?;
+    chosen.settle(request);
     Ok(())
+}
+
+/// Tries `auto` from its own level to finer ones, until the target is kept at one, and leaves that
+/// level in the request. Another choice of the level stands. `coarsest`: the level that `auto` means;
+/// `None` where only the master knows, so that `auto` and level 0 are tried.
+///
+/// # Errors
+/// Those of `choose` at the finest level, and any that is not about the target.
+pub fn at_level_that_keeps_target<T>(
+    request: &mut RenderRequest,
+    coarsest: Option<u32>,
+    mut choose: impl FnMut(&mut RenderRequest) -> Result<T, Fail>,
+) -> Result<T, Fail> {
+    if request.level != LevelChoice::Auto {
+        return choose(request);
+    }
+    let coarse = match coarsest {
+        Some(coarsest) => (1..=coarsest).rev().map(LevelChoice::At).collect(),
+        None => vec![LevelChoice::Auto],
+    };
+    for level in coarse {
+        request.level = level;
+        match choose(request) {
+            Err(e) if e.is_usage() => {
+                let what = request.target.flags();
+                progress::note(&format!(
+                    "--level {level} does not keep {what}; trying a finer one"
+                ));
+            }
+            done => return done,
+        }
+    }
+    request.level = LevelChoice::At(0);
+    choose(request)
 }
 
 #[cfg(test)]

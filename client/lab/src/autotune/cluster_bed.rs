@@ -9,6 +9,7 @@ use super::test_bed::{TestBed, VIEWS};
 use super::trial::Deviation;
 use slabcast_client::Client;
 use slabcast_common::image::{Background, Picture, PixelFormat};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::volume::VolumeInfo;
 use slabcast_master::Handle;
@@ -80,24 +81,28 @@ impl ClusterRun<'_> {
         // Pictures that are magnified here are sent as floats.
         let format = if setting.shrink > 1 { PixelFormat::Rgba32F } else { PixelFormat::Rgb8 };
         let written = Some((setting.shrink, self.request.background));
-        let mut came: Vec<f64> =
-            self.frames(setting, path, format, written)?.iter().map(|f| f.1).collect();
+        let mut came: Vec<f64> = self
+            .frames((setting, self.request.level), path, format, written)?
+            .iter()
+            .map(|f| f.1)
+            .collect();
         came.sort_unstable_by(f64::total_cmp);
         let n = came.len() - 1;
         Ok((came[n] - came[0]) * 1e3 / n.max(1) as f64)
     }
 
-    /// Renders a path at a setting. Returns each frame and the seconds until it arrived or, with
+    /// Renders a path at a setting and level of detail. Returns each frame and the seconds until it arrived or, with
     /// `written` (magnification, background), until it was encoded.
     fn frames(
         &self,
-        setting: &Setting,
+        (setting, level): (&Setting, LevelChoice),
         path: ViewPath,
         format: PixelFormat,
         written: Option<(u32, Background)>,
     ) -> Result<Vec<(Frame, f64)>, Fail> {
         let mut request = self.request.clone();
         request.quality = setting.quality;
+        request.level = level;
         request.path = path;
         request.path.size = setting.drawn_size(request.path.size).unwrap_or(request.path.size);
         let message = request.to_message(&self.info, format, false);
@@ -207,8 +212,12 @@ impl<'a> ClusterBed<'a> {
         ClusterBed { run, base, truths: Vec::new() }
     }
 
-    fn picture(&self, setting: &Setting, path: &ViewPath) -> Result<Picture, Fail> {
-        let frames = self.run.frames(setting, path.clone(), PixelFormat::Rgba32F, None)?;
+    fn picture(
+        &self,
+        (setting, level): (&Setting, LevelChoice),
+        path: &ViewPath,
+    ) -> Result<Picture, Fail> {
+        let frames = self.run.frames((setting, level), path.clone(), PixelFormat::Rgba32F, None)?;
         let [(frame, _)] = &frames[..] else {
             return Err(Fail::failed(format!("one frame was requested, {} arrived", frames.len())));
         };
@@ -246,9 +255,10 @@ impl TestBed for ClusterBed<'_> {
         let ClusterRun { request, info, .. } = &self.run;
         let around = all_around(&request.path);
         format!(
-            "judged by its finest pictures: volume {} transfer {:?} path {} quality {:?} background \
+            "judged by its finest pictures: volume {} level {} transfer {:?} path {} quality {:?} background \
              {:?} pixels {} slabcast {}",
             info.digest,
+            request.level,
             request.transfer.choice(info),
             serde_json::to_string(&around).unwrap_or_default(),
             request.quality,
@@ -271,7 +281,8 @@ impl TestBed for ClusterBed<'_> {
             for i in 0..n {
                 progress.phase(&format!("drawing the exact picture, view {} of {n}", i + 1));
                 let view = path.single_frame(path.first_frame() + (2 * i + 1) * views / (2 * n));
-                let picture = self.picture(&finest, &view)?;
+                // In all detail, whatever level is tried.
+                let picture = self.picture((&finest, LevelChoice::At(0)), &view)?;
                 let truth = picture.pixels.iter().map(|p| p.map(f64::from)).collect();
                 self.truths.push((view, truth));
             }
@@ -279,7 +290,7 @@ impl TestBed for ClusterBed<'_> {
         }
         let mut deviation = Deviation::default();
         for (view, truth) in &self.truths {
-            let picture = self.picture(setting, view)?;
+            let picture = self.picture((setting, self.run.request.level), view)?;
             let figures =
                 ErrorFigures::compare(&picture.pixels, truth, self.run.request.background);
             deviation = deviation.worst(&figures);

@@ -1,7 +1,7 @@
 //! Draws a scene at one setting after another, times it, and has the reference judge it.
 //!
-//! The truth is the requested picture in the limit of thin sheets: with its kernel, its light, at
-//! its size. A setting that changes the model (another kernel, no light) is judged by that truth
+//! The truth is the requested picture in the limit of thin sheets, in all detail: with its kernel, its
+//! light, at its size, of level 0 whatever level is drawn. A setting that changes the model (another kernel, no light) is judged by that truth
 //! like any other, and also by the limit of its own model.
 
 use super::setting::Setting;
@@ -121,6 +121,8 @@ pub struct Trial {
     pub(crate) base: Setting,
     pub(crate) threads: usize,
     scenes_by_kind: Vec<(BrickKind, PathScenes)>,
+    /// Scenes of level 0, if another level is drawn and they were needed.
+    detailed: Option<PathScenes>,
 }
 
 impl Trial {
@@ -145,6 +147,7 @@ impl Trial {
             base,
             threads,
             scenes_by_kind: vec![(kind, scenes)],
+            detailed: None,
         })
     }
 
@@ -162,8 +165,9 @@ impl Trial {
             None => serde_json::to_string(path).unwrap_or_default(),
         };
         format!(
-            "volume {} transfer {transfer} path {how} quality {:?} pixels {} slabcast {}",
+            "volume {} level {} transfer {transfer} path {how} quality {:?} pixels {} slabcast {}",
             self.info.digest,
+            scenes.level(),
             self.request.quality,
             slabcast_common::PIXELS_VERSION,
             env!("CARGO_PKG_VERSION")
@@ -218,6 +222,22 @@ impl Trial {
         Ok(&self.scenes_by_kind[place].1)
     }
 
+    /// Returns the scenes of level 0 at the setting that was asked for.
+    fn detailed_scenes(&mut self, base: &Setting) -> Result<&PathScenes, Fail> {
+        let own = self.info.level;
+        if self.scenes(base)?.level() == own {
+            return self.scenes(base);
+        }
+        let scenes = match self.detailed.take() {
+            Some(scenes) => scenes,
+            None => {
+                let request = self.request.in_all_detail();
+                PathScenes::new(&self.volume, &self.info, &request, self.orientation)?
+            }
+        };
+        Ok(self.detailed.insert(scenes))
+    }
+
     /// Returns the truth of view `view` at a stratified sample of `pixels` of its pixels.
     pub(crate) fn truth(
         &mut self,
@@ -228,7 +248,7 @@ impl Trial {
     ) -> Result<Truth, Fail> {
         let (size, threads, base) = (self.size(), self.threads, self.base);
         let sample = stratified(size, pixels, seed);
-        let scenes = self.scenes(&base)?;
+        let scenes = self.detailed_scenes(&base)?;
         let spec = SceneSpec { quality: base.quality, ..scenes.spec(view) };
         let reference = Reference::new(&spec, scenes.view(view, &base.quality)?, &scenes.bricks);
         let limit = direct::map_pixels(&sample, threads, progress, |[x, y]| reference.pixel(x, y));
@@ -239,8 +259,9 @@ impl Trial {
     pub(crate) fn own_truth(&mut self, setting: &Setting, truth: &Truth) -> Result<Truth, Fail> {
         let threads = self.threads;
         let scenes = self.scenes(setting)?;
-        let spec = SceneSpec { quality: setting.quality, ..scenes.spec(truth.view) };
-        let view = scenes.view(truth.view, &setting.quality)?;
+        let quality = scenes.quality_of_level(setting.quality);
+        let spec = SceneSpec { quality, ..scenes.spec(truth.view) };
+        let view = scenes.view(truth.view, &quality)?;
         let reference = Reference::new(&spec, view, &scenes.bricks);
         let sample = truth.sample.clone();
         let limit = direct::map_parallel(sample.len(), threads, |i, _: &mut ()| {
@@ -318,10 +339,11 @@ impl Trial {
     fn prepare(&mut self, setting: &Setting, view: usize) -> Result<PreparedScene, Fail> {
         let quality = setting.quality;
         quality.check().map_err(|e| Fail::flag(&e))?;
-        let info = self.info.clone();
-        let spec = self.scenes(setting)?.spec(view);
-        let classifier = Classifier::new(&spec.transfer, &info, quality.compositing);
-        let sums = classifier.choose_sums(&quality, &info.lattice).map_err(|e| Fail::flag(&e))?;
+        let scenes = self.scenes(setting)?;
+        let (spec, quality) = (scenes.spec(view), scenes.quality_of_level(quality));
+        let classifier = Classifier::new(&spec.transfer, &spec.volume, quality.compositing);
+        let sums =
+            classifier.choose_sums(&quality, &spec.volume.lattice).map_err(|e| Fail::flag(&e))?;
         let quality = Quality { sums, ..quality };
         Ok(PreparedScene { scene: Arc::new(Scene::new(&SceneSpec { quality, ..spec })), quality })
     }

@@ -3,17 +3,19 @@
 
 use super::{cluster, looks};
 use glam::DVec3;
+use slabcast_common::level::LevelChoice;
 use slabcast_common::quality::{Compositing, Kernel, Quality, Sums, Work};
 use slabcast_common::transfer::{OpacityUnit, TransferFunction};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
+use slabcast_scene::levels::quality_at_level;
 use slabcast_scene::path::{Orientation, PathView, ProjectionKind, ViewPath};
 use slabcast_scene::presets;
 use slabcast_scene::request::PathRequest;
 use slabcast_session::fail::Fail;
-use slabcast_session::path_scenes::SceneBricks;
+use slabcast_session::path_scenes::{SceneBricks, at_level as at_level_of};
 use slabcast_session::volume;
 use std::path::Path;
 use std::sync::Arc;
@@ -29,6 +31,8 @@ pub(crate) struct Case {
     pub(crate) info: VolumeInfo,
     pub(crate) transfer: TransferFunction,
     pub(crate) quality: Quality,
+    /// Level of detail that is drawn.
+    pub(crate) level: u32,
     pub(crate) size: [u32; 2],
 }
 
@@ -76,6 +80,26 @@ const FORMULAS: [Formula; 15] = [
     ("formula:spheres", "spheres/auto/tent", "auto", |q| q.kernel = Kernel::Tent),
 ];
 
+/// A level of detail: the case's name, a formula volume, the transfer function, the level, and the
+/// change of quality.
+type Leveled = (&'static str, &'static str, &'static str, u32, Tweak);
+
+/// Coarser levels: lit and opaque in both orders of classification, of a volume with odd sides, with
+/// the paper's opacities, with opacity by gradient, and of floats.
+const LEVELS: [Leveled; 6] = [
+    ("spheres/auto/level1", "formula:spheres", "auto", 1, |_| {}),
+    ("spheres/auto/after/level2", "formula:spheres", "auto", 2, after),
+    ("spheres/auto/after/odd/level1", "formula:spheres:45", "auto", 1, after),
+    ("wall/peer-vessels/paper/level1", "formula:wall", "peer-vessels", 1, |q| {
+        q.compositing = Compositing::Paper;
+    }),
+    ("spheres/glass/level1", "formula:spheres", "glass", 1, |_| {}),
+    ("ramp/peer-semi/after/level3", "formula:ramp", "peer-semi", 3, after),
+];
+
+/// Number of [`LEVELS`] in the matrix.
+const LEVELS_IN_MATRIX: usize = 1;
+
 /// Number of [`FORMULAS`] in the matrix: those that take different code paths. The others differ in
 /// arithmetic alone, which golden frames cover.
 const IN_MATRIX: usize = 9;
@@ -105,6 +129,9 @@ pub(crate) fn matrix_cases(file: Option<&Path>, size: [u32; 2]) -> Result<Vec<Ca
         cases.push(formula_case(formula, size)?);
     }
     cases.push(leaning(&LEANING[0], size)?);
+    for level in &LEVELS[..LEVELS_IN_MATRIX] {
+        cases.push(at_level(level, size)?);
+    }
     Ok(cases)
 }
 
@@ -132,6 +159,9 @@ pub(crate) fn golden_cases(sample: &Path) -> Result<Vec<Case>, Fail> {
     for lattice in &LEANING {
         cases.push(leaning(lattice, SIZE)?);
     }
+    for level in &LEVELS {
+        cases.push(at_level(level, SIZE)?);
+    }
     Ok(cases)
 }
 
@@ -143,6 +173,11 @@ fn leaning((name, steps, tweak): &Leaning, size: [u32; 2]) -> Result<Case, Fail>
     let mut volume = volume::open("formula:spheres".as_ref())?;
     volume.lattice.steps = steps.map(DVec3::from_array);
     Case::new((*name).into(), Arc::new(volume), "auto", tweak, size)
+}
+
+fn at_level((name, file, tf, level, tweak): &Leveled, size: [u32; 2]) -> Result<Case, Fail> {
+    let volume = Arc::new(volume::open(file.as_ref())?);
+    Ok(Case { level: *level, ..Case::new((*name).into(), volume, tf, tweak, size)? })
 }
 
 /// A file's name without its endings.
@@ -168,7 +203,7 @@ impl Case {
         };
         let mut quality = Quality::before();
         tweak(&mut quality);
-        Ok(Case { name, volume, info, transfer, quality, size })
+        Ok(Case { name, volume, info, transfer, quality, level: 0, size })
     }
 
     /// Name of view `i`.
@@ -197,13 +232,23 @@ impl Case {
 
     /// The request that has a cluster draw both views.
     pub(crate) fn request(&self, cull: bool, work: Work) -> PathRequest {
-        cluster::request(self.path(), &self.transfer, Quality { cull, ..self.quality }, work)
+        let quality = Quality { cull, ..self.quality };
+        let request = cluster::request(self.path(), &self.transfer, quality, work);
+        PathRequest { level: LevelChoice::At(self.level), ..request }
     }
 
     /// Renders both views with the serial renderer and returns their hashes.
     pub(crate) fn truth(&self) -> Result<Vec<Digest32>, Fail> {
-        let SceneBricks { spec, bricks } =
-            SceneBricks::new(&self.volume, &self.info, &self.transfer, self.quality)?;
+        let coarse = at_level_of(&self.volume, self.level);
+        let volume = coarse.as_ref().unwrap_or(&self.volume);
+        let info = volume.info(volume.digest());
+        let to_level = self.info.lattice.to_centre_of(&info.lattice);
+        let SceneBricks { spec, bricks } = SceneBricks::new(
+            volume,
+            &info,
+            &self.transfer,
+            quality_at_level(self.quality, self.level),
+        )?;
         let scene = Arc::new(Scene::new(&spec));
         let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
         let path = self.path();
@@ -211,7 +256,10 @@ impl Case {
             .map(|i| {
                 let view = path
                     .camera(i, &self.info.lattice, orientation)
-                    .and_then(|c| View::new(&self.info.lattice, &c, self.size, &spec.quality))
+                    .and_then(|mut camera| {
+                        camera.target -= to_level;
+                        View::new(&info.lattice, &camera, self.size, &spec.quality)
+                    })
                     .map_err(|e| Fail::failed(format!("{}: {e}", self.view_name(i))))?;
                 Ok(serial::render(&Frame::new(scene.clone(), view), &bricks).sha256())
             })

@@ -3,6 +3,7 @@
 use sha2::{Digest, Sha256};
 use slabcast_client::Client;
 use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::volume::{Digest32, Volume};
@@ -33,6 +34,7 @@ pub(super) fn request(
     PathRequest {
         client_key: slabcast_session::request::client_key(),
         volume: VolumeChoice::Default,
+        level: LevelChoice::default(),
         path,
         transfer: TransferChoice::Function(Box::new(transfer.clone())),
         quality,

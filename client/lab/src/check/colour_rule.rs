@@ -91,7 +91,7 @@ struct Line {
 
 /// Runs the command.
 pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
-    let request = args.of.scene.request_before(Work::default())?;
+    let request = args.of.request_before(Work::default())?;
     let given = Quality::before();
     for (flag, given) in [
         ("thickness", request.quality.thickness != given.thickness),

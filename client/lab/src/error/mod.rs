@@ -45,7 +45,8 @@ const MODEL_TOLERANCE: f64 = 1e-5;
 /// bits with their slivers) and rounding (of positions, and f32 arithmetic). Between the limit and
 /// an ideal lie two errors of the model, which are no part of that sum: truncation (the limit with
 /// the whole Gaussian, neither cut at the radius nor lowered by its edge value) and ripple (the
-/// limit of a field in which a constant comes back constant).
+/// limit of a field in which a constant comes back constant). With --level the limit is that of all
+/// detail, and the level is a source of its own.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_long_help = "\
 Examples:
@@ -55,7 +56,7 @@ Examples:
   slabcast lab error brain.nii.gz --map error.png --pixels all     pixel by pixel (minutes)
   slabcast lab error brain.nii.gz --compositing paper --pixels 16384 --json
 
-JSON: one object. Each of limit, same_thickness, thickness, cutoff, slivers, quantisation, rounding,
+JSON: one object. Each of limit, same_thickness, level (of a coarser one), thickness, cutoff, slivers, quantisation, rounding,
 rounding_positions, rounding_arithmetic, truncation and ripple is {rmse, max, most_999,
 share_above_1, rmse_srgb8, pixels}: 1/255 (most_999 is kept by 99.9 % of the pixels), the share from
 0 to 1, and the pixels that are not blank; what is not finite is null. sum: {squares, plain,
@@ -151,10 +152,46 @@ fn any_shut(picture: &Picture, eps: f64) -> bool {
 fn measure(args: &ErrorArgs) -> Result<ErrorResult, Fail> {
     let threads = args.threads.count();
     let scene = SingleFrame::read(&args.of, threads, |_| Ok(()))?;
-    match scene.spec.quality.classify {
+    let detailed = scene.in_all_detail(&args.of)?;
+    let classify = scene.spec.quality.classify;
+    let mut result = match classify {
         Classify::Before => measure_before(args, scene, threads),
         Classify::After => measure_after(args, scene, threads),
+    }?;
+    if let Some(detailed) = detailed {
+        add_level(&mut result, &detailed, threads);
     }
+    Ok(result)
+}
+
+/// Adds the error of a coarser level, of which all else was measured: its limit against that of level
+/// 0, which is the truth from here on.
+fn add_level(result: &mut ErrorResult, detailed: &SingleFrame, threads: usize) {
+    let mut progress = Progress::new(false).counting("pixel");
+    let pixels = format!("{} pixels of level 0", result.sample.len());
+    progress.frames(result.sample.len() as u64, &pixels);
+    let reference = detailed.reference();
+    let (sample, judging) = (&result.sample, Instant::now());
+    let truth =
+        direct::map_pixels(sample, threads, (&mut progress, 0), |[x, y]| reference.pixel(x, y));
+    progress.end();
+    let width = result.picture.size[0] as usize;
+    let pixel = |&[x, y]: &[u32; 2]| result.picture.pixels[y as usize * width + x as usize];
+    let got: Vec<[f32; 4]> = sample.iter().map(pixel).collect();
+    let own: Vec<[f32; 4]> = result.limit.iter().map(|c| c.map(|x| x as f32)).collect();
+    let background = result.scene.background;
+    let row = |name, what, got: &[[f32; 4]]| Row {
+        name,
+        what,
+        figures: ErrorFigures::compare(got, &truth, background),
+    };
+    let whole = row("limit", "against the limit in all detail: all of it", &got);
+    let level = row("level", "the limit at this level, against all detail", &own);
+    result.whole[0] = whole;
+    result.sources.insert(0, level);
+    result.judged += judging.elapsed();
+    result.total += judging.elapsed();
+    result.limit = truth;
 }
 
 /// Thickness of the picture's sheets over that of the sheets which its planes are compared with.

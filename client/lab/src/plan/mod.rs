@@ -22,7 +22,7 @@ use slabcast_schedule::FrameJob;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::output::{OutputFolder, probe, write_atomic};
 use slabcast_session::path_scenes::PathScenes;
-use slabcast_session::progress::{Progress, warn};
+use slabcast_session::progress::{self, Progress, warn};
 use slabcast_session::request::{OpenedVolume, RenderRequest, VolumeSceneArgs, WorkArgs};
 use slabcast_session::{machine, parse, signals};
 use slabcast_sim::{Link, one_core_ms};
@@ -135,7 +135,7 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
         Schedule::Auto => vec![Schedule::Region, Schedule::Slab],
         one => vec![one],
     };
-    let request = args.of.scene.request(work)?;
+    let request = args.of.request(work)?;
     let workers = &args.workers.0;
     let most = workers.iter().copied().max().unwrap_or(1);
     if u64::from(most) * u64::from(args.threads) > 65536 {
@@ -222,6 +222,7 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
         }
     };
     progress.end();
+    let held = held(&scenes);
     drop(scenes);
     let link = Link {
         bytes_per_s: args.link.0.map(|bits| bits / 8.0 * GOODPUT),
@@ -272,11 +273,20 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
         };
         predicted.push(Predicted { schedule, rows, rehearsed, orders });
     }
-    let output = PlanOutput { args, frames, measured: &measured, predicted: &predicted };
+    let output = PlanOutput { args, frames, held, measured: &measured, predicted: &predicted };
     if let Some(dir) = &args.output {
         output.write(dir)?;
     }
     say(&if args.json { format!("{}\n", output.json()) } else { output.table() })
+}
+
+/// Says which level is drawn, and what a worker that needs all of it is sent and holds.
+fn held(scenes: &PathScenes) -> String {
+    let volume = scenes.spec(0).volume;
+    let [x, y, z] = volume.lattice.dims;
+    let bytes: u64 = scenes.bricks.iter().map(|brick| brick.encoded_len() as u64).sum();
+    let level = volume.level;
+    format!("level {level}: {x} x {y} x {z} samples, {} of bricks", progress::bytes(bytes))
 }
 
 /// Measures the processor time of messages here; warns and returns `None` if that fails.
@@ -378,6 +388,8 @@ fn losses_table(name: &str, rows: &[Row]) -> String {
 struct PlanOutput<'a> {
     args: &'a PlanArgs,
     frames: usize,
+    /// Level that is drawn, and the bricks of it.
+    held: String,
     measured: &'a Measured,
     predicted: &'a [Predicted],
 }
@@ -411,11 +423,12 @@ impl PlanOutput<'_> {
         let edge = trace.frames.last().map_or(64, |f| f.alone_edge);
         let when = if self.measured.now { "measured here" } else { "measured before (--trace)" };
         let mut text = format!(
-            "{}; {}\n{when}: {} tiles, each {} times; alone, one core takes {:.2} ms a frame (tiles \
+            "{}; {}\n{}\n{when}: {} tiles, each {} times; alone, one core takes {:.2} ms a frame (tiles \
              of {edge} pixels)\n{}\npredicted from that, by the scheduler itself against virtual \
              workers and links:\n",
             self.title(),
             self.cluster(),
+            self.held,
             self.tiles(),
             trace.about.repeats,
             one_core_ms(trace),

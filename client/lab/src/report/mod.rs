@@ -217,7 +217,7 @@ pub fn run(args: &ReportArgs) -> Result<(), Fail> {
 }
 
 fn measure(args: &ReportArgs) -> Result<Report, Fail> {
-    let request = args.of.scene.request(Work::default())?;
+    let request = args.of.request(Work::default())?;
     let threads = args.threads.count();
     let mut progress = Progress::new(false).counting("setting");
     progress.phase(&format!("reading {}", args.of.volume.display()));

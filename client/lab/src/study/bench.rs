@@ -56,7 +56,7 @@ pub(super) struct Bench<'a> {
 impl Bench<'_> {
     /// Opens the volume and refuses requests that can't be drawn.
     pub(super) fn open(args: &StudyArgs) -> Result<Bench<'_>, Fail> {
-        let mut request = args.of.scene.request_before(work(paper::SLABS[0]))?;
+        let mut request = args.of.request_before(work(paper::SLABS[0]))?;
         if args.quick && request.path.frames() > QUICK_VIEWS {
             let first = request.path.first_frame() as u32;
             request.path.range = Some([first, first + QUICK_VIEWS as u32 - 1]);

@@ -13,7 +13,8 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::image::Background;
-use slabcast_common::quality::{Quality, Sums};
+use slabcast_common::level::{LevelChoice, MAX_LEVEL};
+use slabcast_common::quality::Quality;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::view::MAX_EDGE;
@@ -47,6 +48,9 @@ pub struct Provenance {
     pub transfer: TransferFunction,
     /// Quality of the picture, with the number type of sums that was used.
     pub quality: Quality,
+    /// Level of detail that was drawn; 0 = all detail.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub level: u32,
     /// Factor by which the picture's width and height were enlarged after it was drawn; 1 = not at
     /// all.
     #[serde(default = "one", skip_serializing_if = "is_one")]
@@ -72,6 +76,10 @@ pub struct Provenance {
     pub picture_sha256: Option<String>,
 }
 
+fn is_zero(n: &u32) -> bool {
+    *n == 0
+}
+
 fn one() -> u32 {
     1
 }
@@ -95,6 +103,7 @@ impl Provenance {
         let transfer = Transfer::from_function(&self.transfer, self.preset.clone());
         let mut request = RenderRequest::with_defaults(self.path.clone(), transfer);
         request.quality = self.quality;
+        request.level = LevelChoice::At(self.level);
         request.magnify = self.magnify;
         request.background = self.background();
         request.hashed = hash_inside;
@@ -174,6 +183,12 @@ impl Provenance {
         p.transfer.check().map_err(refused)?;
         p.quality.check().map_err(refused)?;
         p.figure.check(p.format == Format::Exr, p.format.has_provenance())?;
+        if p.level > MAX_LEVEL {
+            return Err(Fail::failed(format!(
+                "{file}: level: {} is no level of detail; the file is damaged",
+                p.level
+            )));
+        }
         let fits = |edge: u32| edge.checked_mul(p.magnify).is_some_and(|n| n <= MAX_EDGE);
         if p.magnify == 0 || !p.path.size.into_iter().all(fits) {
             return Err(Fail::failed(format!(
@@ -229,6 +244,8 @@ impl RunProvenance {
         let PathRequest {
             client_key: _,
             volume: _,
+            // Statistics say which it became.
+            level: _,
             path,
             transfer: _,
             quality,
@@ -268,6 +285,7 @@ impl RunProvenance {
                 transfer: request.transfer.function(info).map_err(|e| request.blame(&e))?,
                 // Culling changes no byte.
                 quality: Quality { cull: true, ..quality },
+                level: 0,
                 magnify: request.magnify,
                 background: match background {
                     Background::Transparent => Ground::Word("transparent".into()),
@@ -303,21 +321,23 @@ impl RunProvenance {
 
     /// Returns the provenance of the single frame of these statistics.
     pub fn frame(&self, stats: &FrameStats) -> Provenance {
-        let mut p = self.whole(stats.quality.sums);
+        let mut p = self.whole(stats);
         p.path = p.path.single_frame(stats.frame as usize);
         p.view_sha256 = Some(stats.view_sha256.clone());
         p.pixels_sha256 = self.hash_inside.then(|| stats.pixels_sha256.clone());
         p
     }
 
-    /// Returns the provenance of all frames in one file, with sums as the master decided them.
+    /// Returns the provenance of all frames in one file, with level and sums as the master decided them.
     pub fn movie(&self, stats: &FrameStats) -> Provenance {
-        self.whole(stats.quality.sums)
+        self.whole(stats)
     }
 
-    fn whole(&self, sums: Sums) -> Provenance {
+    /// The level is the same in all frames of a path, and so are the sums.
+    fn whole(&self, stats: &FrameStats) -> Provenance {
         let mut p = self.base.clone();
-        p.quality.sums = sums;
+        p.quality.sums = stats.quality.sums;
+        p.level = stats.level.map_or(0, |level| level.level);
         p
     }
 }

@@ -14,7 +14,7 @@ use slabcast_common::image::Background;
 use slabcast_common::quality::{
     Borders, Classify, Compositing, Kernel, Quality, Schedule, Splat, Sums, Work,
 };
-use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_common::volume::{ValueSummary, Volume, VolumeInfo};
 use slabcast_scene::path::{
     Axis, Crop, Fit, Key, KeyFrames, Orientation, ProjectionKind, Side, Turntable, ViewPath,
 };
@@ -122,7 +122,19 @@ impl AxisArgs {
     /// # Errors
     /// The axes are parallel.
     pub fn for_volume(&self, volume: &Volume) -> Result<Orientation, Fail> {
-        Orientation::for_volume(self.up, self.front, &volume.summary, volume.anatomical)
+        self.for_summary(&volume.summary)
+    }
+
+    /// Returns the axes of a volume without its samples, which must be told apart from each other.
+    ///
+    /// # Errors
+    /// Both flags name one axis.
+    pub fn for_info(&self, info: &VolumeInfo) -> Result<Orientation, Fail> {
+        self.for_summary(&info.summary)
+    }
+
+    fn for_summary(&self, summary: &ValueSummary) -> Result<Orientation, Fail> {
+        Orientation::for_volume(self.up, self.front, summary, summary.anatomical)
             .map_err(|e| Fail::flag(&e))
     }
 }
@@ -436,6 +448,30 @@ impl VolumeSceneArgs {
     /// Returns whether no flag says what is in the file.
     pub fn input_is_empty(&self) -> bool {
         self.input.is_empty()
+    }
+
+    /// Returns the request of a command that draws in the quality that is given.
+    ///
+    /// # Errors
+    /// A flag or file is wrong in itself, or a quality target is given.
+    pub fn request(&self, work: Work) -> Result<RenderRequest, Fail> {
+        Ok(RenderRequest { level: self.input.level(), ..self.scene.request(work)? })
+    }
+
+    /// Returns the request of a command about the paper's order, as [`SceneArgs::request_before`].
+    ///
+    /// # Errors
+    /// As [`SceneArgs::request_before`].
+    pub fn request_before(&self, work: Work) -> Result<RenderRequest, Fail> {
+        Ok(RenderRequest { level: self.input.level(), ..self.scene.request_before(work)? })
+    }
+
+    /// Returns the request of a command that can choose the quality by a target.
+    ///
+    /// # Errors
+    /// A flag or file is wrong in itself.
+    pub fn request_with_target(&self, work: Work) -> Result<RenderRequest, Fail> {
+        Ok(RenderRequest { level: self.input.level(), ..self.scene.request_with_target(work)? })
     }
 
     /// Opens the volume and checks that the request can be drawn of it.

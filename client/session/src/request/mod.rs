@@ -17,6 +17,7 @@ use crate::fail::Fail;
 use crate::quality_target::QualityTarget;
 use crate::transfer::Transfer;
 use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::level::LevelChoice;
 use slabcast_common::quality::{InvalidField, Quality, Work};
 use slabcast_common::view::View;
 use slabcast_common::volume::VolumeInfo;
@@ -39,6 +40,8 @@ pub struct RenderRequest {
     pub transfer: Transfer,
     /// Quality of the pictures: all that changes pixels beside volume, views and colours.
     pub quality: Quality,
+    /// Level of detail of the pictures.
+    pub level: LevelChoice,
     /// Error or time that the quality is to be chosen by; empty if the user gave none.
     pub target: QualityTarget,
     /// Factor by which the width and height of drawn pictures are enlarged; 1 = not at all.
@@ -63,6 +66,12 @@ impl RenderRequest {
         Ok(RenderRequest::with_defaults(path, Transfer::from_name(tf)?))
     }
 
+    /// Returns the request for all detail that there is.
+    #[must_use]
+    pub fn in_all_detail(&self) -> RenderRequest {
+        RenderRequest { level: LevelChoice::default(), ..self.clone() }
+    }
+
     /// Returns the size of the pictures in pixels, magnified.
     pub fn size(&self) -> [u32; 2] {
         self.path.size.map(|n| n * self.magnify)
@@ -82,6 +91,7 @@ impl RenderRequest {
             side: None,
             transfer,
             quality: Quality::default(),
+            level: LevelChoice::default(),
             target: QualityTarget::default(),
             magnify: 1,
             work: Work::default(),
@@ -268,6 +278,7 @@ impl RenderRequest {
         PathRequest {
             client_key: client_key(),
             volume: VolumeChoice::Digest(info.digest),
+            level: self.level,
             path: self.path.clone(),
             transfer: self.transfer.choice(info),
             quality: self.quality,

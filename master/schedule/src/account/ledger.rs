@@ -299,6 +299,7 @@ impl Ledger {
             poisoned: Vec::new(),
             critical_path: Some(self.path.sentence(now.saturating_sub(self.began), self.cull_us)),
             rehearsed: false,
+            level: None,
         };
         (stats, self.spans)
     }

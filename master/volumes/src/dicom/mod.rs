@@ -155,6 +155,9 @@ fn read_volume(
     lattice.check().map_err(|e| Problem::malformed("slices", e, "get the series again"))?;
     let supply = Supply::Encoded { name: "DICOM", bytes, ratio: PACKED_RATIO };
     let beside = cap.beside.clone();
+    if let Some(stream) = beside.stream() {
+        return Err(stream.refuse());
+    }
     let (samples, stored) = samples::read(pipe, supply, &layout, cap).map_err(|mut p| {
         p.field = "slices".into();
         p

@@ -182,7 +182,7 @@ fn volume(
         Kind::Number(number) => number.name(),
         Kind::Half => "float16",
     };
-    Ok(Volume::new(name, kind, false, lattice, samples, map))
+    Ok(crate::stream::volume(name, kind, false, lattice, samples, map))
 }
 
 /// Type of an array's numbers.

@@ -14,7 +14,7 @@ use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
 use crate::source::{Notes, Source};
 use crate::unpack::{copy_on, wrapped};
 use crate::{Hints, Opened};
-use slabcast_common::volume::{Lattice, Volume};
+use slabcast_common::volume::Lattice;
 use std::collections::VecDeque;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -235,7 +235,7 @@ pub(crate) fn read_files(
     if hints.raw.spacing.is_none() {
         notes.add("pictures have no spacing; 1 mm was taken (--spacing sets it)");
     }
-    let volume = Volume::new(name, shape.number.name(), false, lattice, samples, map);
+    let volume = crate::stream::volume(name, shape.number.name(), false, lattice, samples, map);
     Ok(Opened { volume, notes: notes.take() })
 }
 

@@ -1,5 +1,4 @@
-use super::*;
-use slabcast_common::volume::Samples;
+use slabcast_common::volume::{Samples, Volume};
 
 /// A PNG picture of `width` x `height` pixels from raw rows.
 pub(crate) fn png(

@@ -1,7 +1,10 @@
 use super::*;
 use proptest::prelude::*;
+use slabcast_common::block_set::BlockSet;
 use slabcast_common::brick::local_position;
-use slabcast_common::shade::NO_NORMAL;
+use slabcast_common::gradient::encode_magnitude;
+use slabcast_common::shade::{NO_NORMAL, encode_normal};
+use slabcast_common::transfer::Support;
 use slabcast_common::volume::{Lattice, ValueMap};
 use slabcast_scene::path::{Crop, CropUnit};
 
@@ -12,17 +15,7 @@ fn span(a: f64, b: f64) -> Support {
 /// Builds a store and compares it with a plain loop over all voxels of the volume.
 fn check(volume: &Volume, support: &Support, normals: bool) -> BrickStore {
     let support = support.clone();
-    check_all(
-        volume,
-        &BrickNeeds {
-            support,
-            normals,
-            gradients: false,
-            halo: 0,
-            coefficients: false,
-            crop: None,
-        },
-    )
+    check_all(volume, &BrickNeeds { support, normals, ..BrickNeeds::default() })
 }
 
 fn check_all(volume: &Volume, needs: &BrickNeeds) -> BrickStore {
@@ -141,7 +134,8 @@ proptest! {
         });
         let gradients = seed % 3 == 0;
         let halo = seed % 4;
-        let needs = BrickNeeds { support, normals, gradients, halo, coefficients: false, crop };
+        let needs =
+            BrickNeeds { support, normals, gradients, halo, crop, ..BrickNeeds::default() };
         check_all(&volume, &needs);
     }
 }
@@ -197,14 +191,7 @@ fn relevance_table_matches_support_for_every_code() {
 #[test]
 fn brick_encoding_is_shared_between_threads() {
     let v = Volume::from_fn_u8("v", [32; 3], |i, j, k| (i * j + k) as u8 | 1);
-    let needs = BrickNeeds {
-        support: span(1.0, 255.0),
-        normals: true,
-        gradients: false,
-        halo: 0,
-        coefficients: false,
-        crop: None,
-    };
+    let needs = BrickNeeds { support: span(1.0, 255.0), normals: true, ..BrickNeeds::default() };
     let store = BrickStore::build(&v, Digest32::default(), &needs);
     let id = store.infos()[7].id;
     let seen: Vec<usize> = std::thread::scope(|s| {
@@ -213,4 +200,114 @@ fn brick_encoding_is_shared_between_threads() {
         threads.into_iter().map(|t| t.join().expect("no panic")).collect()
     });
     assert!(seen.windows(2).all(|w| w[0] == w[1]));
+}
+
+/// A long ramp: each block has values of its own.
+fn ramp() -> Arc<Volume> {
+    Arc::new(Volume::from_fn_u8("ramp", [640, 70, 20], |i, j, k| (i / 3 + (j + k) % 2) as u8))
+}
+
+/// Checks that two stores hold the same bricks.
+fn assert_same(a: &BrickStore, b: &BrickStore) {
+    assert_eq!(a.infos(), b.infos());
+    for info in a.infos().iter() {
+        assert_eq!(a.encoded(info.id), b.encoded(info.id), "brick {}", info.id);
+    }
+}
+
+#[test]
+fn edit_of_a_support_cuts_only_the_blocks_that_it_changes() {
+    let volume = ramp();
+    let digest = volume.digest();
+    let source: Arc<dyn BlockSource> = Arc::new(MemorySource::new(volume.clone(), digest));
+    let with = |lo: f64, hi: f64, halo| BrickNeeds {
+        support: span(lo, hi),
+        halo,
+        normals: halo == 0,
+        ..BrickNeeds::default()
+    };
+    for halo in [0, 2] {
+        let before =
+            BrickStore::cut(&source, 0, &with(60.0, 90.0, halo), None, u64::MAX).expect("memory");
+        for (lo, hi) in [(59.0, 90.0), (61.0, 90.0), (60.0, 97.0), (0.0, 30.0), (60.0, 90.0)] {
+            let needs = with(lo, hi, halo);
+            let after =
+                BrickStore::cut(&source, 0, &needs, Some(&before), u64::MAX).expect("memory");
+            assert_same(&after, &BrickStore::build(&volume, digest, &needs));
+            let shared = before.blocks.iter().zip(&after.blocks).filter(|(a, b)| {
+                a.as_ref().zip(b.as_ref()).is_some_and(|(a, b)| Arc::ptr_eq(a, b))
+            });
+            let (shared, all) = (shared.count(), before.blocks.iter().flatten().count());
+            match (lo, hi) {
+                (60.0, 90.0) => assert_eq!(shared, all, "nothing changed"),
+                (0.0, 30.0) => assert_eq!(shared, 0),
+                _ => assert!(shared > 0 && shared < all, "{shared} of {all} for {lo}..{hi}"),
+            }
+        }
+        // Other needs share nothing.
+        let other = BrickNeeds { gradients: true, ..with(60.0, 90.0, halo) };
+        let after = BrickStore::cut(&source, 0, &other, Some(&before), u64::MAX).expect("memory");
+        assert_same(&after, &BrickStore::build(&volume, digest, &other));
+    }
+}
+
+#[test]
+fn contents_beyond_the_budget_are_dropped_and_cut_again() {
+    let volume = ramp();
+    let digest = volume.digest();
+    let source: Arc<dyn BlockSource> = Arc::new(MemorySource::new(volume.clone(), digest));
+    for halo in [0, 2] {
+        let needs = BrickNeeds { support: span(20.0, 250.0), halo, ..BrickNeeds::default() };
+        let whole = BrickStore::build(&volume, digest, &needs);
+        for keep in [0, whole.bytes() / 3, u64::MAX] {
+            let store = BrickStore::cut(&source, 0, &needs, None, keep).expect("memory");
+            assert_eq!(store.may_read(), keep < whole.bytes());
+            let held = || {
+                let blocks = store.blocks.iter().flatten();
+                blocks.filter(|b| b.held().is_some()).map(|b| b.bytes()).sum::<u64>()
+            };
+            let largest = store.blocks.iter().flatten().map(|b| b.bytes()).max().expect("one");
+            assert!(held() <= keep);
+            for info in whole.infos().iter().chain(whole.infos().iter().rev()) {
+                assert_eq!(store.encoded(info.id), whole.encoded(info.id));
+                assert_eq!(store.brick(info.id), whole.brick(info.id));
+                assert!(held() <= keep.saturating_add(largest), "{} of {keep}", held());
+            }
+        }
+    }
+}
+
+#[test]
+fn blocks_meet_without_a_seam() {
+    let hash = |i: u32| i.wrapping_mul(2_654_435_761).rotate_left(13) >> 5;
+    let volume =
+        Volume::from_fn_u8("v", [131, 66, 9], |i, j, k| hash(i + 131 * (j + 66 * k)) as u8);
+    for (halo, normals) in [(0, true), (1, false), (2, true), (3, false)] {
+        let support = span(245.0, 255.0);
+        check_all(
+            &volume,
+            &BrickNeeds { support, normals, gradients: normals, halo, ..BrickNeeds::default() },
+        );
+    }
+}
+
+#[test]
+fn window_holds_the_bricks_of_its_blocks_and_no_others() {
+    let volume = ramp();
+    let (digest, support) = (volume.digest(), span(20.0, 250.0));
+    let needs = BrickNeeds { support, halo: 2, ..BrickNeeds::default() };
+    let whole = BrickStore::build(&volume, digest, &needs);
+    let mut window = BlockSet::new(volume.lattice.dims);
+    [3, 4, 17].into_iter().for_each(|block| window.insert(block));
+    let needs = BrickNeeds { window: Some(Arc::new(window)), ..needs };
+    let part = BrickStore::build(&volume, digest, &needs);
+    assert_ne!(part.key(), whole.key());
+    for (block, (part, whole)) in part.blocks.iter().zip(&whole.blocks).enumerate() {
+        let infos = |b: &Option<Arc<CutBlock>>| b.as_ref().map(|b| b.infos.clone());
+        let is_in = [3, 4, 17].contains(&block);
+        assert_eq!(infos(part), infos(whole).filter(|_| is_in), "block {block}");
+    }
+    for info in part.infos().iter() {
+        assert_eq!(part.encoded(info.id), whole.encoded(info.id));
+    }
 }

@@ -118,6 +118,8 @@ impl SharedStream {
     }
 }
 
+impl Stream for SharedStream {}
+
 impl Read for SharedStream {
     fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
         self.stream().read(buf)
@@ -493,7 +495,7 @@ fn finish(
             p.field = format!("DataArray {} {}", quoted(&array.name), p.field);
             p
         })?;
-    Ok(Volume::new(name, array.number.name(), false, lattice, samples, map))
+    Ok(crate::stream::volume(name, array.number.name(), false, lattice, samples, map))
 }
 
 fn read_array(

@@ -39,26 +39,26 @@ pub(super) fn is_array(root: &Folder, folder: &str) -> bool {
 }
 
 /// An array's metadata.
-pub(super) struct Array {
+pub(crate) struct Array {
     /// The opened folder, which no chunk's file is outside of.
-    root: Arc<Folder>,
+    pub(super) root: Arc<Folder>,
     /// The array's path in it.
-    folder: String,
+    pub(super) folder: String,
     pub(super) shape: Vec<u64>,
     /// Names of the axes, if the array gives one for each; an axis without a name has an empty one.
     pub(super) names: Option<Vec<String>>,
     /// Shape of a chunk file, which holds one chunk or a shard.
-    grid: Vec<u64>,
+    pub(super) grid: Vec<u64>,
     /// Type of the samples in memory.
-    pub(super) number: Number,
+    pub(crate) number: Number,
     /// Name of their type in the file.
     pub(super) kind: &'static str,
     pub(super) endian: Endian,
     /// Sample in place of missing chunks, little-endian.
-    fill: [u8; 8],
-    key: ChunkKey,
-    codecs: Codecs,
-    shard: Option<Shard>,
+    pub(super) fill: [u8; 8],
+    pub(super) key: ChunkKey,
+    pub(super) codecs: Codecs,
+    pub(super) shard: Option<Shard>,
 }
 
 /// Where a shard lies: its bytes in the file, the index of its first sample, and its shape.
@@ -70,7 +70,7 @@ struct ShardPlace<'a> {
 }
 
 /// How chunk files are named.
-struct ChunkKey {
+pub(super) struct ChunkKey {
     /// First part of the path: `c` in version 3, empty in version 2.
     prefix: &'static str,
     separator: char,
@@ -125,7 +125,7 @@ impl Array {
     }
 
     /// Returns the shape that is decoded at a time: a chunk, or an inner chunk of a shard.
-    fn inner(&self) -> &[u64] {
+    pub(super) fn inner(&self) -> &[u64] {
         self.shard.as_ref().map_or(&self.grid, |s| s.innermost())
     }
 
@@ -207,7 +207,7 @@ impl Array {
     }
 
     /// Checks the numbers of files and of inner chunks that reading has to look at.
-    pub(super) fn check_counts(&self, placed: &Placed) -> Result<(), Problem> {
+    pub(crate) fn check_counts(&self, placed: &Placed) -> Result<(), Problem> {
         let along = |step: &[u64]| {
             placed.axes.iter().flatten().map(|&a| self.shape[a].div_ceil(step[a])).product::<u64>()
         };
@@ -582,7 +582,7 @@ impl Array {
 
 impl ChunkKey {
     /// Returns the path of the chunk file at grid position `cell`.
-    fn path(&self, cell: &[u64]) -> String {
+    pub(super) fn path(&self, cell: &[u64]) -> String {
         let numbers = cell.iter().map(u64::to_string);
         let prefix = (!self.prefix.is_empty()).then(|| self.prefix.to_string());
         prefix.into_iter().chain(numbers).collect::<Vec<_>>().join(&self.separator.to_string())

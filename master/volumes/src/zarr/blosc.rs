@@ -10,7 +10,7 @@ fn bad(what: impl Into<String>) -> Problem {
 }
 
 /// Decodes a container to at most `most` bytes.
-pub(super) fn decode(data: &[u8], most: usize) -> Result<Vec<u8>, Problem> {
+pub(crate) fn decode(data: &[u8], most: usize) -> Result<Vec<u8>, Problem> {
     let head: &[u8; 16] = data.first_chunk().ok_or_else(|| bad("is cut off"))?;
     let word = |i: usize| u32::from_le_bytes([head[i], head[i + 1], head[i + 2], head[i + 3]]);
     let (flags, type_size) = (head[2], usize::from(head[3]).max(1));
@@ -95,12 +95,81 @@ fn unpack(kind: u8, from: &[u8], to: &mut [u8]) -> Result<(), Problem> {
     }
 }
 
+/// Bytes of a block that is packed at a time: fits the second-level cache.
+const BLOCK_BYTES: usize = 256 << 10;
+
+/// Packs numbers of `size` bytes with lz4, their bytes shuffled, as c-blosc reads them.
+///
+/// # Panics
+/// If the numbers take 4 GiB or more, or are not whole.
+pub(crate) fn encode(numbers: &[u8], size: usize) -> Vec<u8> {
+    assert!(numbers.len().is_multiple_of(size) && numbers.len() < u32::MAX as usize);
+    let shuffled = size > 1;
+    let block = BLOCK_BYTES.min(numbers.len()).max(size);
+    let starts = 16 + 4 * numbers.len().div_ceil(block);
+    let mut out = vec![0; starts];
+    let mut plain = Vec::new();
+    for (i, part) in numbers.chunks(block).enumerate() {
+        let part = match shuffled {
+            true => {
+                shuffle(part, size, &mut plain);
+                &plain[..]
+            }
+            false => part,
+        };
+        let at = out.len();
+        out[16 + 4 * i..20 + 4 * i].copy_from_slice(&(at as u32).to_le_bytes());
+        let most = lz4_flex::block::get_maximum_output_size(part.len());
+        out.resize(at + 4 + most, 0);
+        let packed = lz4_flex::block::compress_into(part, &mut out[at + 4..]);
+        let len = match packed {
+            Ok(len) if len < part.len() => len,
+            // As it is.
+            _ => {
+                out[at + 4..at + 4 + part.len()].copy_from_slice(part);
+                part.len()
+            }
+        };
+        out[at..at + 4].copy_from_slice(&(len as u32).to_le_bytes());
+        out.truncate(at + 4 + len);
+    }
+    // Whole blocks, packed by lz4.
+    let mut flags = 0x10 | 1 << 5 | u8::from(shuffled);
+    if out.len() >= 16 + numbers.len() {
+        flags = 2 | u8::from(shuffled);
+        out.truncate(16);
+        out.extend_from_slice(numbers);
+    }
+    out[..4].copy_from_slice(&[2, 1, flags, size as u8]);
+    for (i, n) in [numbers.len(), block, out.len()].into_iter().enumerate() {
+        out[4 + 4 * i..8 + 4 * i].copy_from_slice(&(n as u32).to_le_bytes());
+    }
+    out
+}
+
+/// Sorts bytes: first those that are first in their number, then the second ones, and so on.
+fn shuffle(numbers: &[u8], size: usize, out: &mut Vec<u8>) {
+    fn of<const SIZE: usize>(numbers: &[u8], out: &mut [u8]) {
+        for (byte, to) in out.chunks_exact_mut(numbers.len() / SIZE).enumerate() {
+            let words = numbers.chunks_exact(SIZE);
+            to.iter_mut().zip(words).for_each(|(to, word)| *to = word[byte]);
+        }
+    }
+    out.resize(numbers.len(), 0);
+    match size {
+        2 => of::<2>(numbers, out),
+        4 => of::<4>(numbers, out),
+        8 => of::<8>(numbers, out),
+        _ => unreachable!("numbers of one, two, four or eight bytes"),
+    }
+}
+
 /// Undoes the byte shuffle: first bytes of all numbers, then second bytes, and so on. Bytes left
 /// over are not shuffled.
 fn unshuffle(plain: &[u8], size: usize, out: &mut Vec<u8>) {
     let n = plain.len() / size;
-    let start = out.len();
-    out.resize(start + n * size, 0);
+    let (start, whole) = (out.len(), n * size);
+    out.resize(start + whole, 0);
     let to = &mut out[start..];
     match size {
         2 => unshuffle_of::<2>(plain, to),
@@ -113,7 +182,7 @@ fn unshuffle(plain: &[u8], size: usize, out: &mut Vec<u8>) {
             }
         }
     }
-    out.extend(&plain[n * size..]);
+    out.extend(&plain[whole..]);
 }
 
 /// [`unshuffle`] of numbers of `SIZE` bytes, written so that it is compiled to whole registers.

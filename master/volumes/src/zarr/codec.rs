@@ -159,13 +159,24 @@ impl Codecs {
         len: u64,
         bytes: usize,
     ) -> Result<Vec<u8>, Problem> {
-        // No encoding makes data much larger, so a longer file is refused unread.
-        let most = 2 * bytes as u64 + 4096;
-        if len > most {
-            return Err(damaged(format!("has {len} bytes for {bytes} of samples")));
-        }
+        Codecs::check_len(len, bytes)?;
         let mut data = Vec::with_capacity(len as usize + 1);
         from.take(len).read_to_end(&mut data).map_err(|e| Problem::io("file", &e))?;
+        self.decode_bytes(data, bytes)
+    }
+
+    /// Checks the length of an encoded chunk, before it is read, against that of its samples. No
+    /// encoding makes data much larger.
+    pub(super) fn check_len(len: u64, bytes: usize) -> Result<(), Problem> {
+        match len > 2 * bytes as u64 + 4096 {
+            true => Err(damaged(format!("has {len} bytes for {bytes} of samples"))),
+            false => Ok(()),
+        }
+    }
+
+    /// Decodes a chunk, which must become `bytes` bytes.
+    pub(super) fn decode_bytes(&self, mut data: Vec<u8>, bytes: usize) -> Result<Vec<u8>, Problem> {
+        let most = 2 * bytes as u64 + 4096;
         for (i, codec) in self.list.iter().enumerate().rev() {
             // Between two codecs the data may still be compressed.
             let before = &self.list[..i];
@@ -424,20 +435,31 @@ impl Shard {
         (at, len): (u64, u64),
         grid: &[u64],
     ) -> Result<Vec<(u64, u64)>, Problem> {
-        let counts = grid.iter().zip(&self.inner).map(|(g, i)| g / i);
-        let count = counts.into_iter().try_fold(1u64, u64::checked_mul);
-        let bytes = count.and_then(|n| n.checked_mul(16)?.checked_add(4 * u64::from(self.checked)));
-        let Some(bytes) = bytes.filter(|b| *b <= len) else {
-            return Err(damaged(format!("has {len} bytes, less than its index takes")));
-        };
+        let (start, bytes) = self.index_place(len, grid)?;
         let io = |e: std::io::Error| Problem::io("index", &e);
-        let start = at + if self.at_end { len - bytes } else { 0 };
+        let start = at + start;
         file.seek(SeekFrom::Start(start)).map_err(io)?;
         let mut data = Vec::new();
         file.take(bytes).read_to_end(&mut data).map_err(io)?;
         if data.len() as u64 != bytes {
             return Err(damaged("changed while it was read".into()));
         }
+        self.parse_index(data)
+    }
+
+    /// Returns the first byte and the size of the index of a shard of `len` bytes.
+    pub(super) fn index_place(&self, len: u64, grid: &[u64]) -> Result<(u64, u64), Problem> {
+        let counts = grid.iter().zip(&self.inner).map(|(g, i)| g / i);
+        let count = counts.into_iter().try_fold(1u64, u64::checked_mul);
+        let bytes = count.and_then(|n| n.checked_mul(16)?.checked_add(4 * u64::from(self.checked)));
+        let Some(bytes) = bytes.filter(|b| *b <= len) else {
+            return Err(damaged(format!("has {len} bytes, less than its index takes")));
+        };
+        Ok((if self.at_end { len - bytes } else { 0 }, bytes))
+    }
+
+    /// Parses an index: offset and size, in bytes, of each inner chunk.
+    pub(super) fn parse_index(&self, mut data: Vec<u8>) -> Result<Vec<(u64, u64)>, Problem> {
         if self.checked {
             data = Codec::Crc32c.decode(data, usize::MAX)?;
         }

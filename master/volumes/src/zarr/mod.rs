@@ -8,10 +8,12 @@
 //! crates to build, one of them with an advisory (`lru`); hence a reader of our own. `ruzstd` and
 //! `lz4_flex`, both in Rust, decode zstd and lz4.
 
-mod array;
-mod blosc;
+pub(crate) mod array;
+pub(crate) mod blosc;
+pub(crate) mod chunks;
 mod codec;
-mod json;
+pub(crate) mod json;
+mod own;
 
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::limit::{ByteCap, free_memory};
@@ -21,8 +23,9 @@ use crate::units::{Step, steps_in_mm};
 use crate::{Hints, Opened, reads};
 use array::Array;
 use json::{Json, path};
+pub(crate) use own::Own;
 use serde_json::Value;
-use slabcast_common::volume::{Lattice, Volume};
+use slabcast_common::volume::{CoarseLevel, Lattice, ValueMap, Volume};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -35,47 +38,105 @@ fn has_node(root: &Folder, folder: &str) -> bool {
     ["zarr.json", ".zarray", ".zgroup", ".zattrs"].iter().any(|f| root.has(&path(folder, f)))
 }
 
+/// A picture in a folder: an array, or a pyramid of them.
+pub(crate) struct Picture {
+    root: Arc<Folder>,
+    /// Path of the pyramid's group in the folder.
+    group: &'static str,
+    /// Metadata of the pyramid; `None` for an array.
+    pyramid: Option<(Json, Axes)>,
+    /// What our own files say beside the format's metadata.
+    own: Option<Own>,
+    /// Choices that were made, for people.
+    pub(crate) notes: Vec<String>,
+}
+
+impl Picture {
+    /// Opens a folder that is an array or a pyramid.
+    pub(crate) fn open(folder: &Path) -> Result<Picture, Problem> {
+        let root = Arc::new(Folder::open(folder, "folder")?);
+        let mut notes = Vec::new();
+        if array::is_array(&root, "") {
+            return Ok(Picture { root, group: "", pyramid: None, own: None, notes });
+        }
+        let mut group = "";
+        let mut scales = multiscales(&root, group)?;
+        // bioformats2raw writes each picture into a numbered group of its own.
+        if scales.is_none() && has_node(&root, "0") && !array::is_array(&root, "0") {
+            group = "0";
+            scales = multiscales(&root, group)?;
+            notes.push("the first picture (0) of several was read".into());
+        }
+        let Some(scales) = scales else {
+            return Err(Problem::unsupported(
+                "multiscales",
+                "is missing: this Zarr group is no OME-Zarr picture",
+                "give the folder of an array in it",
+            ));
+        };
+        if scales.len() == 0 {
+            return Err(Problem::malformed(
+                "multiscales",
+                "is empty",
+                "give the folder of an array",
+            ));
+        }
+        let image = scales.entry(0);
+        let axes = Axes::from_image(&image)?;
+        image.required("datasets")?;
+        let own = Own::read(&root, group)?;
+        Ok(Picture { root, group, pyramid: Some((image, axes)), own, notes })
+    }
+
+    /// Returns the number of levels.
+    pub(crate) fn levels(&self) -> usize {
+        match &self.pyramid {
+            None => 1,
+            Some((image, _)) => image.get("datasets").map_or(0, |list| list.len()),
+        }
+    }
+
+    /// Opens a level. Its lattice is not checked.
+    ///
+    /// # Panics
+    /// If there is no such level.
+    pub(crate) fn level(&self, level: usize, pick: &Pick) -> Result<(Array, Placed), Problem> {
+        let Some((image, axes)) = &self.pyramid else {
+            let array = Array::open(&self.root, "")?;
+            let placed = Placed::without_metadata(&array, pick)?;
+            return Ok((array, placed));
+        };
+        let dataset = image.required("datasets")?.entry(level);
+        let array = Array::open(&self.root, &path(self.group, dataset.required("path")?.text()?))?;
+        let mut placed = axes.place(&array, (image, &dataset), pick)?;
+        if let Some(own) = &self.own {
+            placed.lattice = own.lattice(level, placed.lattice)?;
+        }
+        Ok((array, placed))
+    }
+
+    /// Returns what our own files say.
+    pub(crate) fn own(&self) -> Option<&Own> {
+        self.own.as_ref()
+    }
+}
+
 /// Opens a folder that is an array or a pyramid.
 pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let mut notes = Vec::new();
-    let root = Arc::new(Folder::open(folder, "folder")?);
-    if array::is_array(&root, "") {
+    let picture = Picture::open(folder)?;
+    let mut notes = picture.notes.clone();
+    if picture.pyramid.is_none() {
         hints.check_flags(reads::ZARR)?;
-        let array = Array::open(&root, "")?;
-        let mut placed = Placed::without_metadata(&array, &hints.pick)?;
-        placed.spacing = hints.raw.spacing.unwrap_or(placed.spacing);
-        return read(array, placed, &name, notes, hints.cap());
+        let (array, mut placed) = picture.level(0, &hints.pick)?;
+        if let Some(spacing) = hints.raw.spacing {
+            placed.lattice = Lattice::from_spacing(placed.lattice.dims, spacing);
+        }
+        return read(array, placed, None, &name, notes, hints.cap());
     }
     hints.check_flags(reads::OME_ZARR)?;
-    let mut group = "";
-    let mut scales = multiscales(&root, group)?;
-    // bioformats2raw writes each picture into a numbered group of its own.
-    if scales.is_none() && has_node(&root, "0") && !array::is_array(&root, "0") {
-        group = "0";
-        scales = multiscales(&root, group)?;
-        notes.push("the first picture (0) of several was read".into());
-    }
-    let Some(scales) = scales else {
-        return Err(Problem::unsupported(
-            "multiscales",
-            "is missing: this Zarr group is no OME-Zarr picture",
-            "give the folder of an array in it",
-        ));
-    };
-    if scales.len() == 0 {
-        return Err(Problem::malformed("multiscales", "is empty", "give the folder of an array"));
-    }
-    let image = scales.entry(0);
-    let axes = Axes::from_image(&image)?;
-    let levels = image.required("datasets")?;
-    let count = levels.len();
-    let open = |level: usize| -> Result<(Array, Placed), Problem> {
-        let dataset = levels.entry(level);
-        let array = Array::open(&root, &path(group, dataset.required("path")?.text()?))?;
-        let placed = axes.place(&array, (&image, &dataset), &hints.pick)?;
-        Ok((array, placed))
-    };
+    let count = picture.levels();
+    let open = |level: usize| picture.level(level, &hints.pick);
     let level = match hints.level {
         Some(level) if (level as usize) < count => level as usize,
         Some(level) => {
@@ -120,30 +181,47 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
             count - 1
         ));
     }
-    read(array, placed, &name, notes, hints.cap())
+    // Opacities are of the finest level, whatever is drawn.
+    let vox = |placed: &Placed| placed.lattice.vox();
+    let finest_vox = match level {
+        0 => vox(&placed),
+        _ => open(0)
+            .map_or_else(|_| vox(&placed) / f64::from(1u32 << level.min(31)), |(_, p)| vox(&p)),
+    };
+    let coarse = (level > 0).then_some(CoarseLevel { level: level as u32, finest_vox });
+    let mut opened = read(array, placed, picture.own(), &name, notes, hints.cap())?;
+    opened.volume.coarse = coarse;
+    Ok(opened)
 }
 
 fn read(
     array: Array,
     placed: Placed,
+    own: Option<&Own>,
     name: &str,
     mut notes: Vec<String>,
     cap: ByteCap,
 ) -> Result<Opened, Problem> {
-    let lattice = Lattice {
-        origin: glam::DVec3::from_array(placed.origin),
-        ..Lattice::from_spacing(placed.dims.map(|n| n as u32), placed.spacing)
-    };
+    let lattice = placed.lattice;
     array.check_counts(&placed)?;
     // Missing chunks are filled, so no byte need be there for a sample.
     cap.check(placed.bytes(&array), array.stored_bytes(&cap, &placed), "shape")?;
     notes.extend(placed.notes.iter().cloned());
-    let (samples, map) = array.read(&placed, &cap.beside)?;
-    lattice
-        .check()
-        .map_err(|e| Problem::malformed("coordinateTransformations", e, "correct the scale"))?;
-    let file_type = array.kind;
-    let volume = Volume::new(name, file_type, false, lattice, samples, map);
+    let (samples, stored) = array.read(&placed, &cap.beside)?;
+    placed.check()?;
+    let mut map = stored;
+    if let Some(rescale) = own.and_then(|own| own.rescale) {
+        let ValueMap { scale, offset } = rescale;
+        cap.beside.rescale(rescale);
+        map = ValueMap { scale: scale * stored.scale, offset: scale * stored.offset + offset };
+    }
+    let file_type = own.map_or(array.kind, |own| &own.file_type);
+    let anatomical = own.is_some_and(|own| own.anatomical);
+    let volume = Volume::new(name, file_type, anatomical, lattice, samples, map);
+    let (lo, hi) = volume.summary.range();
+    if !(lo.is_finite() && hi.is_finite() && map.scale.is_normal()) {
+        return Err(own::bad("rescale", "takes the values out of the range of numbers"));
+    }
     Ok(Opened { volume, notes })
 }
 
@@ -171,9 +249,8 @@ pub(crate) struct Placed {
     pub(crate) axes: [Option<usize>; 3],
     /// Index along each axis of the array that is none of these; 0 along these.
     pub(crate) at: Vec<u64>,
-    spacing: [f64; 3],
-    origin: [f64; 3],
-    notes: Vec<String>,
+    pub(crate) lattice: Lattice,
+    pub(crate) notes: Vec<String>,
 }
 
 impl Placed {
@@ -221,12 +298,22 @@ impl Placed {
         others.into_iter().zip(picked).for_each(|(a, index)| at[a] = index);
         let dims = axes.map(|a| a.map_or(1, |a| array.shape[a]));
         // Before anything is counted in bytes.
-        crate::samples::Layout::new(dims, array.number, array.endian, "shape")?;
-        Ok(Placed { dims, axes, at, spacing, origin, notes })
+        let layout = crate::samples::Layout::new(dims, array.number, array.endian, "shape")?;
+        let lattice = Lattice {
+            origin: glam::DVec3::from_array(origin),
+            ..Lattice::from_spacing(layout.dims, spacing)
+        };
+        Ok(Placed { dims, axes, at, lattice, notes })
+    }
+
+    /// Checks that the lattice can be drawn.
+    pub(crate) fn check(&self) -> Result<(), Problem> {
+        let bad = |e| Problem::malformed("coordinateTransformations", e, "correct the scale");
+        self.lattice.check().map_err(bad)
     }
 
     /// Returns the size of the samples in the file's type, in bytes.
-    fn bytes(&self, array: &Array) -> u64 {
+    pub(crate) fn bytes(&self, array: &Array) -> u64 {
         self.dims.iter().product::<u64>() * array.number.bytes()
     }
 }
@@ -251,7 +338,7 @@ fn unnamed_space(array: &Array, names: &[String]) -> [Option<usize>; 3] {
 }
 
 /// Names and units of a picture's axes.
-struct Axes {
+pub(crate) struct Axes {
     names: Vec<String>,
     units: Vec<Option<String>>,
 }

@@ -7,8 +7,8 @@ use super::shared::{
 use super::{digest_from_wire, required, wire};
 use crate::convert::WireError;
 use crate::convert::numbers::{
-    SummaryFields, check_lattice, matrix_from_wire, positive, size_from_wire, summary_from_fields,
-    triple_from_wire, vector_from_wire,
+    SummaryFields, check_lattice, finest_vox_from_wire, matrix_from_wire, positive, size_from_wire,
+    summary_from_fields, triple_from_wire, vector_from_wire,
 };
 use bytes::Bytes;
 use glam::DVec3;
@@ -37,6 +37,8 @@ fn volume_to_wire(info: &VolumeInfo) -> wire::Volume {
         histogram: s.histogram.clone(),
         nan_samples: s.nan,
         infinite_samples: s.infinite,
+        level: info.level,
+        finest_vox: if info.level == 0 { 0.0 } else { info.finest_vox },
     }
 }
 
@@ -61,7 +63,9 @@ fn volume_from_wire(info: wire::Volume) -> Result<VolumeInfo, WireError> {
         infinite_samples: info.infinite_samples,
     };
     let summary = summary_from_fields(kind_from_wire("kind", info.kind)?, fields)?;
-    Ok(VolumeInfo { digest: digest_from_wire("digest", &info.digest)?, lattice, summary })
+    let finest_vox = finest_vox_from_wire(&lattice, info.level, info.finest_vox)?;
+    let (digest, level) = (digest_from_wire("digest", &info.digest)?, info.level);
+    Ok(VolumeInfo { digest, lattice, summary, level, finest_vox })
 }
 
 /// Converts a scene to its message on the wire.

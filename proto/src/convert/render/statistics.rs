@@ -9,6 +9,7 @@ use super::submit::{schedule_from_wire, schedule_to_wire};
 use super::wire;
 use crate::convert::{WireError, required};
 use prost::Message;
+use slabcast_common::level::LevelStats;
 use slabcast_common::quality::Classify;
 use slabcast_common::stats::{
     Bound, BoundAndEstimate, BrickStats, ErrorStats, Estimate, FrameMs, FrameStats, LeftOut,
@@ -111,6 +112,12 @@ pub(super) fn statistics_to_wire(stats: &FrameStats, room: usize) -> Vec<wire::F
         poisoned: Vec::new(),
         critical_path: stats.critical_path.clone(),
         rehearsed: stats.rehearsed,
+        level: stats.level.map(|level| wire::LevelStatistics {
+            level: level.level,
+            pixels_per_vox: level.pixels_per_vox,
+            samples: level.samples,
+            finest_samples: level.finest_samples,
+        }),
     };
     let mut parts = Parts { room, used: head.encoded_len(), parts: vec![head] };
     for worker in &stats.workers {
@@ -222,6 +229,12 @@ fn statistics_from_wire(s: wire::FrameStatistics) -> Result<FrameStats, WireErro
         poisoned: poisoned.collect(),
         critical_path: s.critical_path,
         rehearsed: s.rehearsed,
+        level: s.level.map(|level| LevelStats {
+            level: level.level,
+            pixels_per_vox: level.pixels_per_vox,
+            samples: level.samples,
+            finest_samples: level.finest_samples,
+        }),
     })
 }
 

@@ -9,6 +9,7 @@ use super::volume::{volume_choice_from_wire, volume_choice_to_wire};
 use super::{enum_conversions, wire};
 use crate::convert::{WireError, name_from_wire, required};
 use slabcast_common::image::PixelFormat;
+use slabcast_common::level::{LevelChoice, MAX_LEVEL};
 use slabcast_common::quality::Classify;
 use slabcast_common::quality::{Borders, Keep, Schedule, Work};
 use slabcast_scene::request::PathRequest;
@@ -47,6 +48,7 @@ pub fn submit_to_wire(request: &PathRequest) -> wire::SubmitPathRequest {
         want_trace: request.want_trace,
         without_hash: !request.want_hash,
         volume: volume_choice_to_wire(&request.volume),
+        level: level_to_wire(request.level),
     }
 }
 
@@ -59,6 +61,7 @@ pub fn submit_from_wire(request: wire::SubmitPathRequest) -> Result<PathRequest,
     Ok(PathRequest {
         client_key: name_from_wire("client_key", request.client_key)?,
         volume: volume_choice_from_wire(request.volume)?,
+        level: level_from_wire(request.level.unwrap_or_default())?,
         path: path_from_wire(required("path", request.path)?).map_err(|e| e.within("path"))?,
         transfer: choice_from_wire(request.transfer.unwrap_or_default())
             .map_err(|e| e.within("transfer"))?
@@ -71,6 +74,30 @@ pub fn submit_from_wire(request: wire::SubmitPathRequest) -> Result<PathRequest,
         want_trace: request.want_trace,
         want_hash: !request.without_hash,
     })
+}
+
+/// Level 0 is left out, as by clients that know no levels.
+fn level_to_wire(level: LevelChoice) -> Option<wire::LevelChoice> {
+    use wire::level_choice::Choice;
+    let choice = match level {
+        LevelChoice::At(0) => return None,
+        LevelChoice::At(number) => Choice::Number(number),
+        LevelChoice::Auto => Choice::Automatic(wire::AutomaticLevel {}),
+    };
+    Some(wire::LevelChoice { choice: Some(choice) })
+}
+
+fn level_from_wire(level: wire::LevelChoice) -> Result<LevelChoice, WireError> {
+    use wire::level_choice::Choice;
+    match level.choice {
+        None => Ok(LevelChoice::default()),
+        Some(Choice::Automatic(wire::AutomaticLevel {})) => Ok(LevelChoice::Auto),
+        Some(Choice::Number(level)) if level <= MAX_LEVEL => Ok(LevelChoice::At(level)),
+        Some(Choice::Number(level)) => {
+            let problem = format!("{level}; give 0 (all detail) to {MAX_LEVEL}");
+            Err(WireError::value("level.number", problem))
+        }
+    }
 }
 
 pub(super) fn choice_to_wire(choice: &TransferChoice) -> wire::TransferChoice {

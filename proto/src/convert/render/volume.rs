@@ -2,7 +2,9 @@
 
 use super::shared::{kind_from_wire, kind_to_wire, vec3_from_wire, vec3_to_wire};
 use super::{axis_from_wire, axis_to_wire, enum_conversions, wire};
-use crate::convert::numbers::{SummaryFields, check_lattice, finite, summary_from_fields};
+use crate::convert::numbers::{
+    SummaryFields, check_lattice, finest_vox_from_wire, finite, summary_from_fields,
+};
 use crate::convert::{
     MAX_REASON, WireError, digest_from_wire, name_from_wire, reason_from_wire, reason_to_wire,
     required,
@@ -254,6 +256,8 @@ fn info_to_wire(info: &VolumeInfo) -> wire::Volume {
             max_code: core.max_code,
             histogram: core.histogram.clone(),
         }),
+        level: info.level,
+        finest_vox: if info.level == 0 { 0.0 } else { info.finest_vox },
     }
 }
 
@@ -285,7 +289,9 @@ fn info_from_wire(info: wire::Volume) -> Result<VolumeInfo, WireError> {
     let core = info.core.map(core_from_wire).transpose().map_err(|e| e.within("core"))?;
     let summary =
         ValueSummary { anatomical: info.anatomical, core, ..summary_from_fields(kind, fields)? };
-    Ok(VolumeInfo { digest: digest_from_wire("digest", &info.digest)?, lattice, summary })
+    let finest_vox = finest_vox_from_wire(&lattice, info.level, info.finest_vox)?;
+    let (digest, level) = (digest_from_wire("digest", &info.digest)?, info.level);
+    Ok(VolumeInfo { digest, lattice, summary, level, finest_vox })
 }
 
 fn core_from_wire(core: wire::ValueCore) -> Result<ValueCore, WireError> {

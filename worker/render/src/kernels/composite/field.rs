@@ -33,8 +33,8 @@ use std::sync::OnceLock;
 /// of all values. On twelve scenes no more than 0.054/255 is lost against m = 8, which is the most.
 const STEPS: [f32; 3] = [100.0, 8000.0, 2.0];
 
-/// The gradient per vox, as a share of the range of all values, that a surface must have for its
-/// normal to be its own: below it the normal turns towards the eye. Without it rounding noise
+/// The gradient per vox of level 0, as a share of the range of all values, that a surface must have
+/// for its normal to be its own: below it the normal turns towards the eye. Without it rounding noise
 /// would light flat tissue.
 pub const FLAT_GRADIENT: f64 = 1.0 / 1020.0;
 
@@ -283,7 +283,7 @@ impl FieldRule {
             kind: scene.kind,
             cell: [((scene.background - scene.hull[0]) * cells) as f32, per_raw as f32],
             slopes,
-            flat: (FLAT_GRADIENT * scene.span * cells) as f32,
+            flat: (FLAT_GRADIENT * scene.coarseness * scene.span * cells) as f32,
             range_per_cell: (255.0 / (cells * scene.span)) as f32,
             thickness: view.thickness as f32,
             faces,

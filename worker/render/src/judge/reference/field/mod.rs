@@ -25,7 +25,7 @@
 //! seen.
 //!
 //! *Light.* With e the direction to the eye and g the gradient (eye axes, codes per vox), the
-//! normal is that of `side g + e range / 1020`, where `side` is the sign of g.e. So a surface is
+//! normal is that of `side g + e range / 1020`, per vox of level 0, where `side` is the sign of g.e. So a surface is
 //! lit from both sides, and tissue too flat to have a side faces the eye instead of sparkling. The
 //! formula is ambient, Lambert and Blinn-Phong.
 //!
@@ -153,7 +153,11 @@ impl FieldReference {
             own_from_index,
             index_from_own,
             reach,
-            lamp: Lamp::new(&spec.transfer.shading, &view, looks.max_code - looks.min_code),
+            lamp: Lamp::new(
+                &spec.transfer.shading,
+                &view,
+                (looks.max_code - looks.min_code) * spec.volume.coarseness(),
+            ),
             looks,
             crop,
             blocks,

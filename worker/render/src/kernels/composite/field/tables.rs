@@ -70,6 +70,8 @@ pub struct FieldScene {
     pub(super) background: f64,
     /// Samples along each index axis.
     pub(super) dims: [u32; 3],
+    /// Length of a vox in vox of level 0.
+    pub(super) coarseness: f64,
     /// The cropping box along the axes that it crops.
     pub(super) crop: Vec<CropFaces>,
     /// Smallest and largest code.
@@ -150,6 +152,7 @@ impl FieldScene {
         FieldScene {
             background,
             dims: lattice.dims,
+            coarseness: spec.volume.coarseness(),
             crop: crop.filter(|f| f.ends.iter().any(|end| end.is_finite())).collect(),
             range: [summary.min_code, summary.max_code],
             span: span(summary),

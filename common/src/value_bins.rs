@@ -1,0 +1,85 @@
+//! Bins of a volume's values, by which blocks and supports are compared.
+//!
+//! Blocks note which bins their samples lie in, and what a transfer function shows is rounded outward
+//! to whole bins. So an edit of a function within a bin changes no brick, and one beyond it changes
+//! those blocks alone that have values there.
+
+use crate::transfer::Support;
+use crate::volume::ValueSummary;
+
+/// 64 bins of sample codes, in ascending order. What lies beyond the first or last edge is in the
+/// first or last bin.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ValueBins {
+    /// Code at which the first bin begins.
+    pub first_code: f64,
+    /// Width of a bin in codes; above zero.
+    pub width: f64,
+}
+
+impl ValueBins {
+    /// Returns bins over the values that nearly all samples have.
+    pub fn of(summary: &ValueSummary) -> ValueBins {
+        let (lo, hi) = match &summary.core {
+            Some(core) => (core.min_code, core.max_code),
+            None => (summary.min_code, summary.max_code),
+        };
+        let width = (hi - lo) / 64.0;
+        ValueBins { first_code: lo, width: if width > 0.0 { width } else { 1.0 } }
+    }
+
+    /// Returns the bin of a code that is not NaN, 0 to 63.
+    #[inline]
+    pub fn bin(&self, code: f64) -> u32 {
+        // The conversion saturates, at infinities too.
+        ((code - self.first_code) / self.width).clamp(0.0, 63.0) as u32
+    }
+
+    /// Returns the bins in which a support has codes.
+    pub fn mask(&self, support: &Support) -> u64 {
+        support.intervals.iter().fold(0, |mask, &(a, b)| {
+            let (first, last) = (self.bin(a), self.bin(b));
+            mask | (u64::MAX >> (63 - (last - first))) << first
+        })
+    }
+
+    /// Returns a support grown to whole bins: the same for all supports with ends in the same bins. What
+    /// lies beyond the bins stays out unless `support` reaches there.
+    #[must_use]
+    pub fn rounded(&self, support: &Support) -> Support {
+        let edge = |bin: u32| self.first_code + self.width * f64::from(bin);
+        let rounded = |&(a, b): &(f64, f64)| {
+            let first = edge(self.bin(a));
+            // Codes at the edge belong to the next bin.
+            let end = edge(self.bin(b) + 1).next_down();
+            (a.min(first), b.max(end))
+        };
+        let all = support.intervals.iter().map(rounded).map(|interval| vec![interval]);
+        let none = Support { intervals: Vec::new(), nan: support.nan };
+        all.map(|intervals| Support { intervals, nan: false }).fold(none, |a, b| a.union(&b))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn supports_with_ends_in_the_same_bins_are_rounded_to_the_same() {
+        let bins = ValueBins { first_code: 0.0, width: 4.0 };
+        let of = |intervals: &[(f64, f64)]| {
+            bins.rounded(&Support { intervals: intervals.to_vec(), nan: true })
+        };
+        let open = |a| (a, f64::INFINITY);
+        assert_eq!(of(&[open(16.0)]), of(&[open(19.9)]));
+        assert_ne!(of(&[open(16.0)]), of(&[open(15.9)]));
+        assert_eq!(of(&[open(17.0)]).intervals, [open(16.0)]);
+        let both = of(&[(17.0, 18.0), (21.0, 30.0), (60.0, 60.0)]);
+        assert_eq!(
+            both.intervals,
+            [(16.0, 20f64.next_down()), (20.0, 32f64.next_down()), (60.0, 64f64.next_down())]
+        );
+        assert!(both.nan && both.contains(19.99) && !both.contains(32.0));
+        assert_eq!(of(&[(-9.0, 300.0)]).intervals, [(-9.0, 300.0)], "beyond the bins as it was");
+    }
+}

@@ -192,7 +192,11 @@ impl Plan {
         if info.level != asked.level {
             views.check(info, |_| ())?;
         }
-        let quality = quality_at_level(request.quality, info.level - asked.level);
+        // The interpolating spline filters all samples of a level, so a file keeps the other.
+        let quality = match drawn.source.whole(drawn.level) {
+            Some(_) => quality_at_level(request.quality, info.level - asked.level),
+            None => request.quality,
+        };
         let compositing = quality.compositing;
         let tween = Tween::from_path(&request.path, &asked.summary)?;
         let mut sums = quality.sums;

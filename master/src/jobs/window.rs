@@ -31,6 +31,11 @@ pub(super) fn fit(
     views: impl FnOnce(&mut dyn FnMut(&View)) -> Result<(), InvalidField>,
 ) -> Result<BrickNeeds, SubmitError> {
     let info = &open.served.info;
+    if needs.coefficients && open.source.whole(open.level).is_none() {
+        let problem = "interpolating filters all samples of a volume, and this one is too large to be in \
+                       memory; take another";
+        return Err(InvalidField::new("kernel", problem).into());
+    }
     let budget = shares.bricks_kept(open);
     if brick_set_bytes(info, &needs) <= budget || needs.coefficients {
         return Ok(needs);

@@ -60,7 +60,7 @@ pub mod volume;
 /// Version of the arithmetic behind the pixels. Two programs that agree on it give the same
 /// bytes for the same view; a change of any golden hash raises it (docs/design/contracts.md,
 /// Exactness).
-pub const PIXELS_VERSION: u32 = 13;
+pub const PIXELS_VERSION: u32 = 14;
 
 pub use protocol::PROTOCOL_VERSION;
 

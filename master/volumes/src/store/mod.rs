@@ -416,6 +416,8 @@ pub fn estimate(
             std::array::from_fn(|a| (lo[a] + BLOCK_EDGE).min(info.lattice.dims[a]) - lo[a]);
         let bricks: u64 = size.iter().map(|&n| u64::from(n.div_ceil(BRICK_EDGE))).product();
         let voxels: u64 = size.iter().map(|&n| u64::from(n)).product();
+        let most = same.most(block, needs.halo);
+        let (bricks, voxels) = (bricks.min(most.0), voxels.min(most.1));
         all.blocks += 1;
         all.bricks += bricks;
         all.bytes += bricks * BRICK_HEAD_BYTES + voxels * voxel;

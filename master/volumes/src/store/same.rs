@@ -1,7 +1,8 @@
 //! Which blocks hold bricks at all, and which an edit of a transfer function leaves as they are.
 
 use crate::blocks::{BlockSummaries, ValueBins};
-use slabcast_common::block_set::BlockSet;
+use slabcast_common::block_set::{BLOCK_EDGE, BlockSet};
+use slabcast_common::brick::BRICK_EDGE;
 use slabcast_common::transfer::Support;
 use slabcast_scene::brick_needs::BrickNeeds;
 use std::sync::Arc;
@@ -56,6 +57,36 @@ impl<'a> SameBlocks<'a> {
     /// Returns whether a block has the same bricks as before.
     pub(super) fn is_same(&self, block: usize) -> bool {
         self.changed.is_some_and(|changed| !self.meets(block, changed))
+    }
+
+    /// Returns how many bricks and voxels a block may hold at most: all of its own where it has visible
+    /// values itself; else those within the halo of a neighbour that has.
+    pub(super) fn most(&self, block: usize, halo: u32) -> (u64, u64) {
+        let (bins, nan) = self.visible;
+        let here = |i: usize| {
+            let summary = &self.summaries.all[i];
+            summary.bins & bins != 0 || (nan && summary.nan)
+        };
+        let bricks = u64::from(BLOCK_EDGE / BRICK_EDGE);
+        if here(block) {
+            return (bricks.pow(3), u64::from(BLOCK_EDGE).pow(3));
+        }
+        let [nx, ny, nz] = self.summaries.dims.map(|n| n as usize);
+        let at = [block % nx, block / nx % ny, block / nx / ny];
+        let mut most = (0, 0);
+        let near = |a: usize, n: usize| at[a].saturating_sub(1)..=(at[a] + 1).min(n - 1);
+        for z in near(2, nz) {
+            for y in near(1, ny) {
+                for x in near(0, nx).filter(|&x| here((z * ny + y) * nx + x)) {
+                    // Axes along which the neighbour lies beside the block: 1 of a face, 3 of a corner.
+                    let beside = [x, y, z].iter().zip(at).filter(|(a, b)| **a != *b).count() as u32;
+                    let voxels =
+                        u64::from(BLOCK_EDGE).pow(3 - beside) * u64::from(halo).pow(beside);
+                    most = (most.0 + bricks.pow(3 - beside), most.1 + voxels);
+                }
+            }
+        }
+        most
     }
 
     /// Returns whether values that decide a block's bricks lie in some bins, or are NaN.

@@ -98,6 +98,9 @@ fn check_all(volume: &Volume, needs: &BrickNeeds) -> BrickStore {
     }
     assert!(seen.is_empty(), "voxels outside of the volume: {seen:?}");
     assert_eq!(relevant, store.relevant_voxels());
+    let source = MemorySource::new(volume, digest);
+    let most = estimate(&source, 0, needs).expect("samples in memory");
+    assert!(store.infos().len() as u64 <= most.bricks && store.bytes() <= most.bytes, "{most:?}");
     store
 }
 

@@ -37,7 +37,7 @@ impl SingleFrame {
     ) -> Result<SingleFrame, Fail> {
         let mut request = args.scene.request_with_target(Work::default())?;
         check(request.path.size)?;
-        let OpenedVolume { volume, info, orientation } = args.open(&request)?;
+        let OpenedVolume { volume, info, orientation } = args.open(&mut request)?;
         let volume = Arc::new(volume);
         settle(&volume, &info, &mut request, orientation, threads)?;
         let scenes = PathScenes::new(&volume, &info, &request, orientation)?;

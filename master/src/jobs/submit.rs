@@ -72,6 +72,8 @@ pub(crate) struct Plan {
 /// The views of a path, each made when it is asked for.
 pub(crate) struct Views {
     request: Arc<PathRequest>,
+    /// Quality of the views: the request's, as the volume has it.
+    quality: Quality,
     /// The path with the numbers of its framing, if it asked for them.
     framed: Option<Box<ViewPath>>,
     prepared: Prepared,
@@ -93,7 +95,7 @@ impl Views {
     /// The field of the camera that can't be used.
     pub(crate) fn view(&self, number: u64, info: &VolumeInfo) -> Result<View, InvalidField> {
         let camera = self.prepared.camera(self.path(), number as usize)?;
-        View::new(&info.lattice, &camera, self.request.path.size, &self.request.quality)
+        View::new(&info.lattice, &camera, self.request.path.size, &self.quality)
     }
 
     /// Tries views: all that were given, else [`TRIED_VIEWS`] of the path.
@@ -137,7 +139,8 @@ impl Plan {
         shares: &Shares,
     ) -> Result<Plan, InvalidField> {
         let info = &served.info;
-        request.quality.check()?;
+        let quality = request.quality.for_volume(&info.summary);
+        quality.check()?;
         request.work.check()?;
         request.path.check()?;
         shares.check(&request)?;
@@ -154,16 +157,16 @@ impl Plan {
         let framed = framing.as_ref().map(|f| Box::new(request.path.framed(f)));
         let path = framed.as_deref().unwrap_or(&request.path);
         let prepared = path.prepare(&info.lattice, served.orientation)?.into_prepared();
-        let views = Views { request: request.clone(), framed, prepared };
+        let views = Views { request: request.clone(), quality, framed, prepared };
         views.check(info)?;
-        let compositing = request.quality.compositing;
+        let compositing = quality.compositing;
         let tween = Tween::from_path(&request.path, &info.summary)?;
-        let mut sums = request.quality.sums;
+        let mut sums = quality.sums;
         for tf in tween.iter().flat_map(Tween::key_functions).chain([&transfer]) {
             let classifier = Classifier::new(tf, info, compositing);
-            sums = classifier.choose_sums(&request.quality, &info.lattice)?;
+            sums = classifier.choose_sums(&quality, &info.lattice)?;
         }
-        let quality = Quality { sums, ..request.quality };
+        let quality = Quality { sums, ..quality };
         let wanted =
             BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, &quality)?
                 .with_kept(request.work.keep);

@@ -235,9 +235,17 @@ fn short_name(digest: Digest32) -> String {
     format!("sha256:{digits}")
 }
 
+/// Returns the bytes of a volume's codes, as uploads send and store them.
 fn sample_bytes(info: &VolumeInfo) -> u64 {
     let voxels: u64 = info.lattice.dims.iter().map(|&n| u64::from(n)).product();
-    voxels * info.summary.kind.bytes() as u64
+    voxels * info.summary.code_kind().bytes() as u64
+}
+
+/// Returns the bytes that a volume takes in memory: colours have values beside their codes.
+fn memory_bytes(info: &VolumeInfo) -> u64 {
+    let voxels: u64 = info.lattice.dims.iter().map(|&n| u64::from(n)).product();
+    let values = if info.summary.palette.is_some() { info.summary.kind.bytes() } else { 0 };
+    sample_bytes(info) + voxels * values as u64
 }
 
 impl Library {
@@ -300,7 +308,7 @@ impl Library {
         let listed = entries.by_name.iter().filter_map(|(name, entry)| {
             let read = entry.served.as_ref().map(|served| {
                 let info = &served.info;
-                (info.digest, info.lattice.dims, info.summary.kind)
+                (info.digest, info.lattice.dims, info.summary.code_kind())
             });
             let sampled = entry.served.as_ref().map(|served| sample_bytes(&served.info));
             Some(VolumeEntry {
@@ -516,13 +524,14 @@ impl Library {
             }
             entries.uploaded_bytes()
         };
-        if total > self.memory_bytes {
+        let in_memory = memory_bytes(&header.info);
+        if in_memory > self.memory_bytes {
             return Err(VolumeError::NoRoom(
                 format!(
                     "{}: its samples take {} MiB, and the master has {} MiB for volumes \
                      (--volume-memory)",
                     header.name,
-                    total.div_ceil(1 << 20),
+                    in_memory.div_ceil(1 << 20),
                     self.memory_bytes >> 20
                 ),
                 false,
@@ -672,7 +681,7 @@ impl Entries {
     /// Bytes of the samples in memory that may be dropped.
     fn held_bytes(&self) -> u64 {
         let held = self.by_name.values().filter(|e| e.may_be_dropped());
-        held.filter_map(|e| e.served.as_ref()).map(|s| sample_bytes(&s.info)).sum()
+        held.filter_map(|e| e.served.as_ref()).map(|s| memory_bytes(&s.info)).sum()
     }
 
     /// Bytes of the files of uploads.

@@ -36,8 +36,8 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     }
     let tiffs = matching(tiff_stack::sniff);
     if !tiffs.is_empty() {
-        hints.pick.choose(&[], "folder")?;
-        return tiff_stack::read_files(tiffs, &name, &hints.raw, hints.cap());
+        hints.pick.without_channel().choose(&[], "folder")?;
+        return tiff_stack::read_files(tiffs, &name, &hints.raw, hints.pick, hints.cap());
     }
     // Volume files that the user may have meant. A picture beside one may be its preview.
     const ENDS: [&str; 18] = [
@@ -54,9 +54,9 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
     let (png, jpeg) = (matching(pictures::is_png), matching(pictures::is_jpeg));
     let has_pictures = !png.is_empty() || !jpeg.is_empty();
     if has_pictures && volumes.is_empty() {
-        hints.pick.choose(&[], "folder")?;
+        hints.pick.without_channel().choose(&[], "folder")?;
         let (chosen, left_out) = if png.is_empty() { (jpeg, 0) } else { (png, jpeg.len()) };
-        let mut opened = pictures::read_files(chosen, &name, &hints.raw, hints.cap())?;
+        let mut opened = pictures::read_files(chosen, &name, &hints.raw, hints.pick, hints.cap())?;
         if left_out > 0 {
             opened
                 .notes

@@ -29,7 +29,7 @@ const DENSE: usize = 8;
 pub fn outline(volume: &Volume, support: &Support, crop: Option<&CropBox>) -> Vec<[u32; 3]> {
     let inside = |voxel: [u32; 3]| crop.is_none_or(|c| c.contains(&volume.lattice, voxel));
     let dims = volume.lattice.dims.map(|n| n as usize);
-    match &volume.samples {
+    match volume.codes() {
         Samples::U8(v) => {
             let seen = relevance_table(support, 256);
             outline_of(v, dims, |c| seen[usize::from(c)], inside)

@@ -30,8 +30,7 @@
 //! - DICOM series, one folder of slices (feature `dicom`)
 //! - Zarr arrays of versions 2 and 3, and OME-Zarr pyramids (feature `zarr`)
 //!
-//! [`write`](mod@write) writes NRRD and NIfTI-1. Not read: colours, time series, and volumes
-//! larger than memory.
+//! [`write`](mod@write) writes NRRD and NIfTI-1. Not read: volumes larger than memory.
 //!
 //! Input files are not trusted. A size in a header takes no memory before the bytes were seen;
 //! nothing outside the header's folder is read; every refusal is one line that names the file, the
@@ -40,6 +39,7 @@
 //! This crate has no network, no clock, and knows neither tasks, views nor colours. It does use
 //! threads, since cutting bricks is work for all cores.
 
+mod colours;
 mod data;
 #[cfg(feature = "dicom")]
 pub mod dicom;
@@ -190,7 +190,8 @@ fn open_beside(path: &Path, hints: &Hints) -> Result<Opened, OpenError> {
     let shown = path.to_string_lossy();
     let opened = match shown.strip_prefix(formula::PREFIX) {
         Some(_) => formula::open(&shown).map(Opened::from),
-        None => open_file(path, hints),
+        None => open_file(path, hints)
+            .or_else(|refusal| colours::instead(refusal, path, hints, &open_file)),
     };
     let mut opened = opened.map_err(|problem| OpenError { file: shown.into_owned(), problem })?;
     opened.notes.extend(hints.beside.take_notes());
@@ -347,7 +348,6 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
         return metaimage::read(source, folder, name);
     }
     if vti::sniff(head) {
-        hints.pick.choose(&[], "content")?;
         return vti::read(source, name);
     }
     if tiff_stack::sniff(head) {

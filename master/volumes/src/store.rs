@@ -52,7 +52,7 @@ impl BrickStore {
         let support = &needs.support;
         let coefficients = needs.coefficients.then(|| prefilter::coefficients(volume));
         let coefficients = coefficients.as_deref();
-        let bricks = match &volume.samples {
+        let bricks = match volume.codes() {
             Samples::U8(v) => {
                 let relevant = relevance_table(support, 256);
                 cut(volume, (v, coefficients), needs, Samples::U8, |c| relevant[usize::from(c)])
@@ -169,6 +169,7 @@ pub(crate) fn relevance_table(support: &Support, codes: usize) -> Vec<bool> {
 }
 
 /// Cuts all bricks with a relevant voxel, which hold `coefficients` in place of codes if there are any.
+/// Gradients are those of the samples, which are the codes unless voxels have colours of their own.
 /// A task is a row of bricks along x: a 256^3 volume has
 /// 1024 rows of 16 Ki samples, which keeps any number of cores evenly busy.
 fn cut<T: Copy + Into<f64> + Sync>(
@@ -188,6 +189,11 @@ fn cut<T: Copy + Into<f64> + Sync>(
     });
     let grid = BrickGrid::new(field.dims);
     let gradient_matrix = volume.gradient_matrix();
+    // The luminance or alpha of colours, whose codes are places in a palette.
+    let values = match (&volume.places, &volume.samples) {
+        (Some(_), Samples::U8(values)) => Some(Codes { codes: values, dims: field.dims }),
+        _ => None,
+    };
     let row = |row: u32| {
         let mut bricks = Vec::new();
         let (y, z) = (row % grid.dims[1], row / grid.dims[1]);
@@ -212,7 +218,11 @@ fn cut<T: Copy + Into<f64> + Sync>(
             let gradient = |(&i, &offset)| {
                 let local = slabcast_common::brick::local_position(i);
                 let voxel = std::array::from_fn(|a| corner[a] + local[a]);
-                gradient_matrix * field.central_difference(voxel, offset)
+                gradient_matrix
+                    * match &values {
+                        Some(values) => values.central_difference(voxel, offset),
+                        None => field.central_difference(voxel, offset),
+                    }
             };
             let all = || index.iter().zip(offsets).map(gradient);
             let normals = needs.normals.then(|| all().map(encode_normal).collect());

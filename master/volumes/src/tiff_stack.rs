@@ -45,10 +45,14 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// Reads the pages of one file as slices.
 pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Opened, Problem> {
-    let (len, cap, pick) = (source.len, source.cap.clone(), source.pick);
+    let (len, cap, mut pick) = (source.len, source.cap.clone(), source.pick);
     let mut pages = TiffFile::open(source)?;
     let first = pages.page()?;
     let mut description = pages.description(&first)?;
+    if first.channels > 1 {
+        // It is of the pixels.
+        pick = pick.without_channel();
+    }
     let said = description.slices(&pick)?;
     // Pictures after the first of an OME or tifffile file are volumes of their own.
     let several = match description.writer {
@@ -84,7 +88,7 @@ pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Opene
         }
         Some(said) => {
             planes_start = match description.writer {
-                Writer::ImageJ | Writer::Shaped if count == 1 => {
+                Writer::ImageJ | Writer::Shaped if count == 1 && first.channels == 1 => {
                     pages.planes_start(&first, said.total, len)
                 }
                 _ => None,
@@ -160,6 +164,7 @@ pub(crate) fn read_files(
     files: Vec<PathBuf>,
     name: &str,
     hints: &RawHints,
+    pick: Pick,
     cap: ByteCap,
 ) -> Result<Opened, Problem> {
     let (mut first, mut spacing, mut total) = (None, hints.spacing, 0);
@@ -174,12 +179,16 @@ pub(crate) fn read_files(
             p.field = format!("{} {}", quoted(&shown), p.field);
             p
         };
-        let source = Source::open(path, "file").map_err(name_file)?;
+        let mut source = Source::open(path, "file").map_err(name_file)?;
+        source.pick = pick;
         total += source.len;
         let mut file = TiffFile::open(source).map_err(name_file)?;
         let page = file.page().map_err(name_file)?;
         match &first {
             None => {
+                if page.channels == 1 {
+                    pick.of_pixel(1, "folder")?;
+                }
                 let mut description = file.description(&page).map_err(name_file)?;
                 if let Some(said) = description.slices(&Pick::default()).map_err(name_file)?
                     && (said.total > count || said.total != said.count)
@@ -260,8 +269,12 @@ struct Page {
     width: u32,
     height: u32,
     number: Number,
-    /// Bits of a pixel in the file.
+    /// Bits of a number in the file.
     bits: u32,
+    /// Numbers of a pixel: 1, or 3 or 4 of colours.
+    channels: u32,
+    /// Which of them is read.
+    channel: u32,
 }
 
 impl Page {
@@ -284,10 +297,12 @@ struct TiffFile {
     len: u64,
     white_is_zero: bool,
     palette: bool,
+    pick: Pick,
 }
 
 impl TiffFile {
     fn open(source: Source) -> Result<TiffFile, Problem> {
+        let pick = source.pick;
         let band_max_bytes = BAND_MAX_BYTES.min(BAND_FREE_BYTES.max(2 * source.len));
         let mut limits = Limits::unlimited();
         limits.decoding_buffer_size = band_max_bytes as usize;
@@ -298,7 +313,7 @@ impl TiffFile {
         let (white_is_zero, palette) = (stream.white_is_zero, stream.palette);
         let decoder =
             Decoder::new(BufReader::new(stream)).map_err(|e| tiff_problem(&e))?.with_limits(limits);
-        Ok(TiffFile { decoder, band_max_bytes, len: source.len, white_is_zero, palette })
+        Ok(TiffFile { decoder, band_max_bytes, len: source.len, white_is_zero, palette, pick })
     }
 
     /// Moves to the next page that is no thumbnail; false if there is none.
@@ -325,15 +340,22 @@ impl TiffFile {
     /// Returns size and type of the page; fails if it can't be a slice of a volume.
     fn page(&mut self) -> Result<Page, Problem> {
         let (width, height) = self.decoder.dimensions().map_err(|e| tiff_problem(&e))?;
-        let bits = match self.decoder.colortype().map_err(|e| tiff_problem(&e))? {
-            ColorType::Gray(bits) => bits,
+        let field = "PhotometricInterpretation";
+        let (bits, channels) = match self.decoder.colortype().map_err(|e| tiff_problem(&e))? {
+            ColorType::Gray(bits) => (bits, 1),
+            ColorType::RGB(bits @ (8 | 16)) => (bits, 3),
+            ColorType::RGBA(bits @ (8 | 16)) => (bits, 4),
             other => {
                 return Err(Problem::unsupported(
-                    "PhotometricInterpretation",
-                    format!("{other:?} is not a grey picture"),
-                    "save it in shades of grey, one number a pixel",
+                    field,
+                    format!("{other:?} is neither grey nor RGB of 8 or 16 bits"),
+                    "save it so",
                 ));
             }
+        };
+        let channel = match channels {
+            1 => 0,
+            _ => self.pick.of_pixel(channels, field)? as u32,
         };
         let format = self.decoder.find_tag_unsigned_vec::<u16>(Tag::SampleFormat);
         let format = format.ok().flatten().and_then(|f| f.first().copied()).unwrap_or(1);
@@ -371,7 +393,9 @@ impl TiffFile {
         let rows = u64::from(chunk_height.min(height));
         // A tile is decoded beside its band.
         let tile = if tiled { u64::from(chunk_width) * u64::from(chunk_height) } else { 0 };
-        let band = (rows * u64::from(width) + tile).saturating_mul(number.bytes());
+        // Of colours all are decoded beside the one that is read.
+        let each = if channels > 1 { 1 + channels } else { 1 };
+        let band = (rows * u64::from(width) + tile).saturating_mul(number.bytes() * each);
         if chunk_width == 0 || chunk_height == 0 || band > self.band_max_bytes {
             return Err(Problem::new(
                 OpenErrorKind::TooLarge,
@@ -383,7 +407,7 @@ impl TiffFile {
                 "save it with smaller strips or tiles",
             ));
         }
-        Ok(Page { width, height, number, bits: bits.into() })
+        Ok(Page { width, height, number, bits: bits.into(), channels: channels as u32, channel })
     }
 
     /// Decodes the band of a page that starts at `row`, in the machine's byte order, and returns
@@ -405,7 +429,8 @@ impl TiffFile {
             self.check_chunk(first)?;
             return self.few_bits(page, first, rows, band);
         }
-        if across == 1 && chunk_width >= page.width {
+        let channels = page.channels as usize;
+        if across == 1 && chunk_width >= page.width && channels == 1 {
             let index = first;
             self.check_chunk(index)?;
             let (w, h) = self.decoder.chunk_data_dimensions(index);
@@ -425,11 +450,21 @@ impl TiffFile {
                 return Err(Problem::malformed("TileLength", "does not fit the page", RESAVE));
             }
             tile.clear();
-            samples::reserve(&mut tile, w * h * size)?;
-            tile.resize(w * h * size, 0);
+            samples::reserve(&mut tile, w * h * size * channels)?;
+            tile.resize(w * h * size * channels, 0);
             self.decoder.read_chunk_bytes(index, &mut tile).map_err(|e| self.tile_problem(&e))?;
-            for (row, tile_row) in band.chunks_exact_mut(stride).zip(tile.chunks_exact(w * size)) {
-                row[left..left + w * size].copy_from_slice(tile_row);
+            let rows = tile.chunks_exact(w * size * channels);
+            for (row, tile_row) in band.chunks_exact_mut(stride).zip(rows) {
+                let row = &mut row[left..left + w * size];
+                if channels == 1 {
+                    row.copy_from_slice(tile_row);
+                    continue;
+                }
+                let skip = page.channel as usize * size;
+                let pixels = tile_row.chunks_exact(size * channels);
+                for (to, pixel) in row.chunks_exact_mut(size).zip(pixels) {
+                    to.copy_from_slice(&pixel[skip..skip + size]);
+                }
             }
         }
         Ok(rows)

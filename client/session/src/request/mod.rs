@@ -39,6 +39,8 @@ pub struct RenderRequest {
     pub transfer: Transfer,
     /// Quality of the pictures: all that changes pixels beside volume, views and colours.
     pub quality: Quality,
+    /// Whether a flag asks for classification after reconstruction, and not the default.
+    asks_after: bool,
     /// Error or time that the quality is to be chosen by; empty if the user gave none.
     pub target: QualityTarget,
     /// Factor by which the width and height of drawn pictures are enlarged; 1 = not at all.
@@ -82,6 +84,7 @@ impl RenderRequest {
             side: None,
             transfer,
             quality: Quality::default(),
+            asks_after: false,
             target: QualityTarget::default(),
             magnify: 1,
             work: Work::default(),
@@ -92,16 +95,27 @@ impl RenderRequest {
     }
 
     /// Checks that all of it can be drawn of this volume; `anatomical` says whether the volume's
-    /// file has anatomical axes.
+    /// file has anatomical axes. Voxels with colours of their own take the order of classification
+    /// that they need ([`Quality::for_volume`]).
     ///
     /// # Errors
     /// A flag or a field of a file doesn't fit the volume; the error names it.
     pub fn fit(
-        &self,
+        &mut self,
         info: &VolumeInfo,
         orientation: Orientation,
         anatomical: bool,
     ) -> Result<(), Fail> {
+        if info.summary.palette.is_some() {
+            if self.asks_after {
+                return Err(Fail::usage(
+                    "--classify: the voxels have colours of their own, between which nothing can be \
+                     reconstructed; leave it out, or take one of their numbers with --channel",
+                ));
+            }
+            self.quality = self.quality.for_volume(&info.summary);
+            self.quality.check().map_err(|e| self.blame(&e))?;
+        }
         if let Some(axes) = &self.side {
             let usual = Orientation::for_volume(None, None, &info.summary, anatomical)
                 .map_err(|e| Fail::flag(&e))?;

@@ -22,7 +22,7 @@ use slabcast_common::spelling::nearest;
 use slabcast_common::transfer::{
     ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction, interpolate,
 };
-use slabcast_common::volume::{SampleKind, ValueSummary};
+use slabcast_common::volume::{ColourValue, SampleKind, ValueSummary};
 
 /// Names of the presets and what each is for, in the order of the help text. [`MAPS`] has the
 /// colour maps.
@@ -130,7 +130,14 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, I
     };
     // Where what is dense begins, for those volumes that have no Hounsfield units to say so.
     let dense = air + (top - air) * 0.55;
+    // The opacity that the file gives its voxels.
+    let alpha = summary.palette.as_ref().is_some_and(|p| p.value() == ColourValue::Alpha);
     let tf = match name {
+        "auto" if alpha => {
+            let tf = look(&STONE, [0.0, 1.0], &[]);
+            let opacities = vec![[0.0, 0.0], [255.0, 1.0]];
+            return Ok(TransferFunction { domain: Domain::Value, opacities, ..tf });
+        }
         // Of a CT the skin hides the bones, and the couch the body.
         "auto" if at.is_some() => return by_name("muscle", summary),
         // At the edge of a mask nothing is to be seen but the mask.

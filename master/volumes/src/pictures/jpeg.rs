@@ -1,6 +1,6 @@
 //! Decoder of a JPEG picture, which is decoded whole.
 
-use super::{Shape, check_whole, push_grey};
+use super::{Shape, check_whole, push};
 use crate::error::{OpenErrorKind, Problem};
 use crate::samples::Number;
 use crate::source::Source;
@@ -17,6 +17,8 @@ const FILE_MAX_BYTES: u64 = 48 << 20;
 pub(super) struct Jpeg {
     bytes: Vec<u8>,
     pub(super) shape: Shape,
+    /// Numbers of a pixel: 1, or 3 of colours.
+    pub(super) channels: u64,
 }
 
 impl Jpeg {
@@ -42,14 +44,15 @@ impl Jpeg {
         // One byte a colour, and coefficients of two bytes if it is progressive.
         let each = u64::from(header.components) * if header.process == 2 { 3 } else { 1 };
         check_whole(each * u64::from(header.width) * u64::from(header.height), len)?;
-        Ok(Jpeg { bytes, shape })
+        let channels = if header.components == 1 { 1 } else { 3 };
+        Ok(Jpeg { bytes, shape, channels })
     }
 
-    /// Writes the samples of all rows.
-    pub(super) fn all(&mut self, out: &mut Vec<u8>) -> Result<(), Problem> {
+    /// Writes the samples of all rows: of one channel, or of all that are grey.
+    pub(super) fn all(&mut self, channel: Option<u64>, out: &mut Vec<u8>) -> Result<(), Problem> {
         let bytes = std::mem::take(&mut self.bytes);
         let (pixels, channels) = decode(&bytes)?;
-        push_grey(&pixels, channels, 1, out)?;
+        push(&pixels, (channels, 1), channel, out)?;
         Ok(())
     }
 }

@@ -1,9 +1,9 @@
 //! Reader of stacks of PNG and JPEG pictures: the files of a folder, in the order of the numbers in
 //! their names, become slices.
 //!
-//! A picture is grey, or has colours of which red, green and blue are equal in every pixel. The
-//! values are those that are stored: a PNG of one bit holds 0 and 1. Pictures have no spacing; it
-//! comes from `--spacing`.
+//! A picture is grey, or has colours of which red, green and blue are equal in every pixel; of others one
+//! channel is read. The values are those that are stored: a PNG of one bit holds 0 and 1. Pictures have
+//! no spacing; it comes from `--spacing`.
 
 pub(crate) mod jpeg;
 mod png;
@@ -11,6 +11,7 @@ mod png;
 use crate::Opened;
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::limit::ByteCap;
+use crate::pick::Pick;
 use crate::raw::RawHints;
 use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
 use crate::source::{Notes, Source};
@@ -103,32 +104,56 @@ impl Picture {
         }
     }
 
-    /// Writes the samples of the next rows, big-endian.
-    fn rows(&mut self, out: &mut Vec<u8>) -> Result<(), Problem> {
+    /// Returns the numbers of a pixel that are colours and opacity: 1, 3 or 4.
+    fn channels(&self) -> u64 {
         match self {
-            Picture::Png(png) => png.row(out),
-            Picture::Jpeg(jpeg) => jpeg.all(out),
+            Picture::Png(png) => png.channels(),
+            Picture::Jpeg(jpeg) => jpeg.channels,
+        }
+    }
+
+    /// Writes the samples of the next rows, big-endian: of one channel, or of all that are grey.
+    fn rows(&mut self, channel: Option<u64>, out: &mut Vec<u8>) -> Result<(), Problem> {
+        match self {
+            Picture::Png(png) => png.row(channel, out),
+            Picture::Jpeg(jpeg) => jpeg.all(channel, out),
         }
     }
 }
 
 /// Returns the error for a pixel whose red, green and blue differ.
-fn colours() -> Problem {
-    Problem::unsupported(
+fn colours(channels: usize) -> Problem {
+    let problem = Problem::unsupported(
         "picture",
         "is in colours: red, green and blue differ",
-        "save the stack in shades of grey, or one of its colours",
-    )
+        "take one of them with --channel",
+    );
+    Problem { colours: Some(if channels == 4 { 4 } else { 3 }), ..problem }
 }
 
-/// Writes the grey of pixels of `channels` numbers of `size` bytes: one, grey and opacity, three
-/// colours, or those and opacity. Returns whether all are opaque.
-fn push_grey(
+/// Writes one channel of pixels of `channels` numbers of `size` bytes (one, grey and opacity, three
+/// colours, or those and opacity), or their grey. Returns whether all are opaque, or it matters not.
+fn push(
     pixels: &[u8],
-    channels: usize,
-    size: usize,
+    (channels, size): (usize, usize),
+    channel: Option<u64>,
     out: &mut Vec<u8>,
 ) -> Result<bool, Problem> {
+    if let Some(channel) = channel {
+        let alpha = if channels.is_multiple_of(2) { Some(channels - 1) } else { None };
+        let number = match channel {
+            3 => alpha,
+            c => Some(if channels < 3 { 0 } else { (c as usize).min(2) }),
+        };
+        for pixel in pixels.chunks_exact(channels * size) {
+            match number {
+                Some(i) => out.extend_from_slice(&pixel[i * size..(i + 1) * size]),
+                // What has no opacity of its own is opaque.
+                None => out.extend(std::iter::repeat_n(0xff, size)),
+            }
+        }
+        return Ok(true);
+    }
     if channels == 1 {
         out.extend_from_slice(pixels);
         return Ok(true);
@@ -144,7 +169,7 @@ fn push_grey(
         }
         out.extend_from_slice(at(0));
     }
-    if grey { Ok(opaque) } else { Err(colours()) }
+    if grey { Ok(opaque) } else { Err(colours(channels)) }
 }
 
 /// Reads pictures, in the order given, as slices of a volume called `name`, of at most `cap`.
@@ -152,6 +177,7 @@ pub(crate) fn read_files(
     files: Vec<PathBuf>,
     name: &str,
     hints: &RawHints,
+    pick: Pick,
     cap: ByteCap,
 ) -> Result<Opened, Problem> {
     let count = files.len() as u64;
@@ -164,11 +190,12 @@ pub(crate) fn read_files(
         ));
     }
     let notes = Notes::default();
-    let (mut first, mut total) = (None, 0);
+    let (mut first, mut total, mut channels) = (None, 0, 1);
     for path in &files {
         let shown = quoted(&path.file_name().unwrap_or_default().to_string_lossy());
         let (picture, len) = Picture::open(path, &notes).map_err(|p| in_file(path, p))?;
         total += len;
+        channels = picture.channels().max(channels);
         let (shape, palette) = (picture.shape(), picture.palette().map(<[u8]>::to_vec));
         match &first {
             None => first = Some((shape, palette)),
@@ -184,6 +211,9 @@ pub(crate) fn read_files(
         }
     }
     let (shape, _) = first.expect("the caller passes a file");
+    // Without the flag they may all be grey.
+    let channel = pick.channel.map(|_| pick.of_pixel(channels, "folder")).transpose()?;
+    let channel = channel.filter(|_| channels > 1);
     let sizes = [shape.width.into(), shape.height.into(), count];
     let layout = Layout::new(sizes, shape.number, Endian::Big, "pictures")?;
     let lattice = Lattice::from_spacing(layout.dims, hints.spacing.unwrap_or([1.0; 3]));
@@ -195,11 +225,16 @@ pub(crate) fn read_files(
         rows: Vec::new(),
         consumed: 0,
         left: 0,
+        channel,
         notes: notes.clone(),
     };
     // Deflate is denser than JPEG, of which a byte holds some hundred pixels.
     let supply = Supply::deflate("pictures", total);
-    let (samples, map) = samples::read(&mut stack, supply, &layout, cap)?;
+    let (samples, map) = samples::read(&mut stack, supply, &layout, cap).map_err(|p| {
+        // The first picture with colours may have no opacity where others have.
+        let colours = p.colours.map(|_| channels as u8);
+        Problem { colours, ..p }
+    })?;
     if hints.spacing.is_none() {
         notes.add("pictures have no spacing; 1 mm was taken (--spacing sets it)");
     }
@@ -233,6 +268,8 @@ struct Stack {
     consumed: usize,
     /// Bytes of the current picture that are still to be decoded.
     left: u64,
+    /// The channel that is read of pictures in colours.
+    channel: Option<u64>,
     notes: Notes,
 }
 
@@ -253,7 +290,7 @@ impl Stack {
         let Some((path, picture)) = &mut self.current else { return Ok(false) };
         self.rows.clear();
         self.consumed = 0;
-        picture.rows(&mut self.rows).map_err(|p| in_file(path, p))?;
+        picture.rows(self.channel, &mut self.rows).map_err(|p| in_file(path, p))?;
         let came = self.rows.len() as u64;
         if came == 0 || came > self.left {
             let problem = Problem::new(
@@ -290,7 +327,7 @@ pub(crate) fn one_picture(mut source: Source) -> Result<Vec<u8>, Problem> {
     let (mut rows, mut have) = (Vec::new(), 0);
     while have < need {
         rows.clear();
-        picture.rows(&mut rows)?;
+        picture.rows(None, &mut rows)?;
         if rows.is_empty() {
             return Err(samples::truncated(need, have));
         }

@@ -1,6 +1,6 @@
 //! Decoder of a PNG picture, row by row; an interlaced one is decoded whole.
 
-use super::{Shape, check_whole, push_grey};
+use super::{Shape, check_whole, push};
 use crate::error::{OpenErrorKind, Problem};
 use crate::samples::{self, Number};
 use crate::source::{Notes, Source, Stream};
@@ -57,8 +57,17 @@ impl Png {
         Ok(Png { reader, shape, palette, greys, colour, depth, whole, len, notes })
     }
 
-    /// Writes the samples of the next row, big-endian.
-    pub(super) fn row(&mut self, out: &mut Vec<u8>) -> Result<(), Problem> {
+    /// Returns the numbers of a pixel that are colours and opacity: 1, 3 or 4.
+    pub(super) fn channels(&self) -> u64 {
+        match self.colour {
+            ColorType::Rgb => 3,
+            ColorType::Rgba => 4,
+            _ => 1,
+        }
+    }
+
+    /// Writes the samples of the next row, big-endian: of one channel, or of all that are grey.
+    pub(super) fn row(&mut self, channel: Option<u64>, out: &mut Vec<u8>) -> Result<(), Problem> {
         let Png { reader, shape, greys, colour, depth, whole, len, notes, .. } = self;
         let row = match whole {
             None => {
@@ -82,8 +91,8 @@ impl Png {
         let width = shape.width as usize;
         let indices = out.len();
         let opaque = match depth {
-            BitDepth::Sixteen => push_grey(row, colour.samples(), 2, out)?,
-            BitDepth::Eight => push_grey(row, colour.samples(), 1, out)?,
+            BitDepth::Sixteen => push(row, (colour.samples(), 2), channel, out)?,
+            BitDepth::Eight => push(row, (colour.samples(), 1), channel, out)?,
             // The first pixel is in the highest bits.
             BitDepth::One | BitDepth::Two | BitDepth::Four => {
                 let bits = *depth as usize;

@@ -64,7 +64,7 @@ fn tiff_sample_types_and_imagej_and_ome_spacing() {
     let e = open(one::<colortype::Gray8>(1, 1, &[1], "ImageJ=1\nimages=9\n")).unwrap_err();
     assert!(e.to_string().contains("9 pictures, and 1 pages"), "{e}");
     let e = open(one::<colortype::RGB8>(1, 1, &[1, 2, 3], "")).unwrap_err().to_string();
-    assert!(e.contains("RGB(8) is not a grey picture; save it in shades of grey"), "{e}");
+    assert!(e.contains("a voxel is 3 colours (RGB), not one number; take one of them with"), "{e}");
     let all = pages(2, Compression::Lzw);
     for cut in [8, 20, 60, all.len() / 2, all.len() - 1] {
         let e = open(all[..cut].to_vec()).unwrap_err();

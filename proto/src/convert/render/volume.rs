@@ -1,6 +1,8 @@
 //! Volumes: what DescribeVolume and ListVolumes answer, and the parts of an upload.
 
-use super::shared::{kind_from_wire, kind_to_wire, vec3_from_wire, vec3_to_wire};
+use super::shared::{
+    kind_from_wire, kind_to_wire, palette_to_wire, vec3_from_wire, vec3_to_wire, with_palette,
+};
 use super::{axis_from_wire, axis_to_wire, enum_conversions, wire};
 use crate::convert::numbers::{SummaryFields, check_lattice, finite, summary_from_fields};
 use crate::convert::{
@@ -254,6 +256,7 @@ fn info_to_wire(info: &VolumeInfo) -> wire::Volume {
             max_code: core.max_code,
             histogram: core.histogram.clone(),
         }),
+        palette: s.palette.as_deref().map(palette_to_wire),
     }
 }
 
@@ -285,6 +288,7 @@ fn info_from_wire(info: wire::Volume) -> Result<VolumeInfo, WireError> {
     let core = info.core.map(core_from_wire).transpose().map_err(|e| e.within("core"))?;
     let summary =
         ValueSummary { anatomical: info.anatomical, core, ..summary_from_fields(kind, fields)? };
+    let summary = with_palette(summary, info.palette)?;
     Ok(VolumeInfo { digest: digest_from_wire("digest", &info.digest)?, lattice, summary })
 }
 

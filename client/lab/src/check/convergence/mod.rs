@@ -164,11 +164,13 @@ fn subjects<'a>(
             Some(json) => TransferFunction::from_json(json)
                 .map_err(|e| Fail::failed(format!("{name}: {e}")))?,
             None => {
-                request.fit(&info, orientation, volume.anatomical)?;
+                request.clone().fit(&info, orientation, volume.anatomical)?;
                 request.transfer.function(&info).map_err(|e| request.blame(&e))?
             }
         };
         let pixels = args.pixels as usize;
+        let quality: Quality = quality;
+        let quality = quality.for_volume(&info.summary);
         Ok(SweepScene { name, volume, info, transfer, quality, size, pixels, seed: args.seed })
     };
     if args.volumes.is_empty() {

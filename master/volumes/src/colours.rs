@@ -298,4 +298,4 @@ pub(crate) fn may_be_colours(count: u64, number: Number) -> bool {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

@@ -156,7 +156,7 @@ fn colours_of(volume: &Volume) -> Vec<[u8; 4]> {
     places.iter().map(|&place| palette.colours()[usize::from(place)]).collect()
 }
 
-fn samples_of_colours() -> Vec<(&'static str, usize, Vec<u8>)> {
+pub(crate) fn samples_of_colours() -> Vec<(&'static str, usize, Vec<u8>)> {
     use tiff::encoder::colortype::{RGB8, RGB16, RGBA8};
     let (rgb, rgba) = (beside(3), beside(4));
     let wide: Vec<u8> = rgb.iter().flat_map(|&x| (u16::from(x) * 257).to_le_bytes()).collect();

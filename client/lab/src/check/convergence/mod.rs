@@ -17,7 +17,7 @@ mod sweep;
 use super::case::number;
 use super::scenes::SCENES;
 use crate::plot;
-use slabcast_common::quality::{Classify, Work};
+use slabcast_common::quality::{Classify, Quality, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_scene::path::{Orientation, ProjectionKind, Turntable, ViewPath};
 use slabcast_session::fail::{Fail, say};
@@ -169,8 +169,7 @@ fn subjects<'a>(
             }
         };
         let pixels = args.pixels as usize;
-        let quality: Quality = quality;
-        let quality = quality.for_volume(&info.summary);
+        let quality = Quality::for_volume(quality, &info.summary);
         Ok(SweepScene { name, volume, info, transfer, quality, size, pixels, seed: args.seed })
     };
     if args.volumes.is_empty() {

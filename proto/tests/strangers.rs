@@ -441,11 +441,8 @@ fn bytes_of_hello_and_refused_never_change() {
 #[test]
 fn wrong_palette_is_refused_by_field_before_memory_is_set_aside() {
     use slabcast_common::volume::{ColourValue, Lattice, Palette, Volume};
-    let palette = Palette::sorted(
-        vec![[1, 2, 3, 255], [9, 8, 7, 255]],
-        false,
-        ColourValue::Luminance,
-    );
+    let palette =
+        Palette::sorted(vec![[1, 2, 3, 255], [9, 8, 7, 255]], false, ColourValue::Luminance);
     let lattice = Lattice::from_spacing([2, 1, 1], [1.0; 3]);
     let volume =
         Volume::coloured("c", "RGB uint8", false, lattice, palette.unwrap().into(), vec![0, 1]);

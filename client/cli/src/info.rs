@@ -110,7 +110,8 @@ fn shares(volume: &Volume, info: &VolumeInfo) -> Result<Vec<Share>, Fail> {
                     .filter(|&i| c.classify(samples, i).sigma > 0.0)
                     .count() as u64,
             };
-            let each = 2 + info.summary.code_kind().bytes() as u64 + if tf.shading.on { 2 } else { 0 };
+            let each =
+                2 + info.summary.code_kind().bytes() as u64 + if tf.shading.on { 2 } else { 0 };
             Ok(Share { name, what, voxels, bytes: voxels * each })
         })
         .collect()

@@ -142,8 +142,7 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
     };
     let name = given.as_ref().map_or_else(|| "volumes".to_owned(), |(v, _)| v.name.clone());
     let dims = given.as_ref().map(|(v, _)| v.lattice.dims);
-    let volume_bytes =
-        given.as_ref().map_or(0, |(v, _)| v.memory_bytes());
+    let volume_bytes = given.as_ref().map_or(0, |(v, _)| v.memory_bytes());
     let library = library(args, given, port)?;
     let volumes = library.list(Viewer::own()).len();
     let mut config = MasterConfig::of(library);

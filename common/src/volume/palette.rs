@@ -67,7 +67,9 @@ pub enum PaletteError {
     #[error("has {0} bytes, which are not four a colour")]
     Bytes(usize),
     /// Colours do not ascend. Holds the place of the first that doesn't.
-    #[error("colour {0} is not above the one before; sort them by value, red, green, blue and alpha")]
+    #[error(
+        "colour {0} is not above the one before; sort them by value, red, green, blue and alpha"
+    )]
     Order(usize),
     /// Alphas, or values that are alphas, of voxels that have none.
     #[error("has alphas, of voxels that are said to have none")]

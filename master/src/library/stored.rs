@@ -98,9 +98,7 @@ pub(super) fn read(path: &Path, most_bytes: u64) -> Result<(Volume, Orientation)
             Volume::coloured(name, file_type, anatomical, lattice, palette, places)
                 .map_err(|e| unreadable(format!("{shown}: its palette {e}"), false))?
         }
-        (_, samples) => {
-            Volume::new(name, file_type, anatomical, lattice, samples, summary.map)
-        }
+        (_, samples) => Volume::new(name, file_type, anatomical, lattice, samples, summary.map),
     };
     if volume.digest() != info.digest {
         let reason = format!(

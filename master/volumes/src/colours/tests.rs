@@ -194,7 +194,9 @@ fn every_format_opens_with_its_colours_and_one_channel_is_grey() {
         let palette = volume.summary.palette.as_ref().expect("colours");
         assert_eq!((volume.lattice.dims, palette.channels()), ([5, 4, 3], channels), "{name}");
         let all: Vec<[u8; 4]> = (0..VOXELS)
-            .map(|i| if channels == 4 { voxel(i) } else { [voxel(i)[0], voxel(i)[1], voxel(i)[2], 255] })
+            .map(|i| {
+                if channels == 4 { voxel(i) } else { [voxel(i)[0], voxel(i)[1], voxel(i)[2], 255] }
+            })
             .collect();
         assert_eq!(colours_of(volume), all, "{name}");
         let values: Vec<u8> = all.iter().map(|&c| palette.value().of(c)).collect();
@@ -230,15 +232,17 @@ fn pictures_in_colours_are_a_volume_and_grey_ones_stay_grey() {
     };
     let opened =
         in_folder(&[("1.png", picture(0, 3)), ("2.png", picture(1, 3))], Pick::default()).unwrap();
-    let all: Vec<[u8; 4]> =
-        (0..40).map(|i| [voxel(i)[0], voxel(i)[1], voxel(i)[2], 255]).collect();
+    let all: Vec<[u8; 4]> = (0..40).map(|i| [voxel(i)[0], voxel(i)[1], voxel(i)[2], 255]).collect();
     assert_eq!(colours_of(&opened.volume), all);
     assert_eq!(opened.volume.file_type, "RGB uint8");
     // One with opacity makes all have it; the others are opaque.
     let mixed = [("1.png", picture(0, 3)), ("2.png", picture(1, 4))];
     let opened = in_folder(&mixed, Pick::default()).unwrap();
     let colours = colours_of(&opened.volume);
-    assert_eq!((colours[7], colours[27]), ([voxel(7)[0], voxel(7)[1], voxel(7)[2], 255], voxel(27)));
+    assert_eq!(
+        (colours[7], colours[27]),
+        ([voxel(7)[0], voxel(7)[1], voxel(7)[2], 255], voxel(27))
+    );
     let blue = Pick { channel: Some(2), ..Pick::default() };
     let opened = in_folder(&mixed, blue).unwrap();
     assert_eq!(opened.volume.samples.code(27), f64::from(voxel(27)[2]));
@@ -316,14 +320,16 @@ fn many_colours_are_written_to_the_bit_though_they_are_drawn_rounded() {
         (state >> 24) as u8
     };
     let data: Vec<u8> = (0..3 * 48 * 48 * 48).map(|_| random()).collect();
-    let head = "type: uint8\ndimension: 4\nsizes: 3 48 48 48\nkinds: RGB-color domain domain domain";
+    let head =
+        "type: uint8\ndimension: 4\nsizes: 3 48 48 48\nkinds: RGB-color domain domain domain";
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.nrrd");
     std::fs::write(&path, nrrd(head, &data)).unwrap();
     let (opened, numbers) = crate::open_numbers(&path, &Hints::default()).unwrap();
     let mut out = Vec::new();
     let format = crate::write::Format::Nrrd { gzip: false };
-    crate::write::write(&opened.volume, numbers.as_ref(), format, &mut out, &mut |_| Ok(())).unwrap();
+    crate::write::write(&opened.volume, numbers.as_ref(), format, &mut out, &mut |_| Ok(()))
+        .unwrap();
     assert_eq!(out[out.len() - data.len()..], data);
     let drawn = crate::open_with(&path, &Hints::default()).unwrap();
     assert!(drawn.notes.iter().any(|n| n.contains("were rounded to")), "{:?}", drawn.notes);

@@ -226,14 +226,8 @@ fn bricks_of_colours_hold_places_and_normals_of_the_values() {
     let volume =
         Volume::coloured("c", "RGBA uint8", false, lattice, palette.into(), places.clone());
     let volume = volume.expect("places in it");
-    let grey = Volume::new(
-        "g",
-        "uint8",
-        false,
-        lattice,
-        volume.samples.clone(),
-        ValueMap::IDENTITY,
-    );
+    let grey =
+        Volume::new("g", "uint8", false, lattice, volume.samples.clone(), ValueMap::IDENTITY);
     let needs = |support| BrickNeeds {
         support,
         normals: true,

@@ -15,10 +15,10 @@ mod tags;
 use crate::error::{Problem, quoted};
 use crate::limit::ByteCap;
 use crate::pick::{Axis, Part};
-use crate::{colours, data};
 use crate::samples::{self, Endian, Layout, Number, Supply};
 use crate::source::{BUFFER_BYTES, Notes, Source, Stream};
 use crate::unpack::{Base64, Encoding};
+use crate::{colours, data};
 use blocks::Blocks;
 use glam::{DMat3, DVec3};
 use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
@@ -70,10 +70,11 @@ pub(crate) fn read(source: Source, name: &str) -> Result<Volume, Problem> {
         let (dims, _) = image.dims_and_origin(mask.cells)?;
         let layout = Layout::new(dims, mask.number, file.endian, "ImageData WholeExtent")?;
         let cap = ByteCap { asked: cap.asked, ..ByteCap::default() };
-        let (codes, map) = read_array(file, (&layout, None), open(place)?, cap).map_err(|mut p| {
-            p.field = format!("DataArray {} {}", quoted(&mask.name), p.field);
-            p
-        })?;
+        let (codes, map) =
+            read_array(file, (&layout, None), open(place)?, cap).map_err(|mut p| {
+                p.field = format!("DataArray {} {}", quoted(&mask.name), p.field);
+                p
+            })?;
         hidden.resize(codes.len(), false);
         let flags = hidden.iter_mut().enumerate();
         let count = flags.fold(0u64, |count, (i, hidden)| {

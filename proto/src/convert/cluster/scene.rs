@@ -108,7 +108,10 @@ pub fn scene_from_wire(scene: wire::Scene) -> Result<SceneSpec, WireError> {
         return Err(WireError::value("quality.sums", "is undecided; a scene says which sums"));
     }
     if volume.summary.palette.is_some() && quality.classify == Classify::After {
-        return Err(WireError::value("quality.classify", "is AFTER; colours are classified before"));
+        return Err(WireError::value(
+            "quality.classify",
+            "is AFTER; colours are classified before",
+        ));
     }
     let bricks = BrickSetKey(digest_from_wire("set", &scene.set)?);
     let crop = crop_from_wire(&scene.crop)?;

@@ -10,6 +10,7 @@ use slabcast_common::brick::Brick;
 use slabcast_common::crop::CropBox;
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::{FrameState, Picture};
+use slabcast_common::math::linear_from_srgb;
 use slabcast_common::message::{Counters, SceneSpec};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Classify, Compositing, Kernel, Quality, Sums};
@@ -17,10 +18,7 @@ use slabcast_common::shade::{Light, Shading};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
-use slabcast_common::math::linear_from_srgb;
-use slabcast_common::volume::{
-    ColourValue, Digest32, Lattice, Palette, Samples, ValueMap, Volume,
-};
+use slabcast_common::volume::{ColourValue, Digest32, Lattice, Palette, Samples, ValueMap, Volume};
 use slabcast_render::Simd;
 use slabcast_render::oracle::serial;
 use slabcast_render::region::{BrickSupply, Region, expected_bricks};
@@ -361,19 +359,12 @@ fn colours_of_a_palette_are_drawn_as_a_function_with_the_same_colours_is() {
         let inside = d.iter().map(|x| x * x).sum::<f64>() < 64.0;
         if inside { 1 + (i / 4 + j / 4 + k / 4) as u16 % 4 } else { 0 }
     };
-    let places: Vec<u16> =
-        (0..n * n * n).map(|at| place(at % n, at / n % n, at / n / n)).collect();
+    let places: Vec<u16> = (0..n * n * n).map(|at| place(at % n, at / n % n, at / n / n)).collect();
     let lattice = Lattice::from_spacing([n; 3], [1.0; 3]);
     let coloured =
         Volume::coloured("c", "RGB uint8", false, lattice, palette.clone(), places).unwrap();
-    let grey = Volume::new(
-        "g",
-        "uint8",
-        false,
-        lattice,
-        coloured.samples.clone(),
-        ValueMap::IDENTITY,
-    );
+    let grey =
+        Volume::new("g", "uint8", false, lattice, coloured.samples.clone(), ValueMap::IDENTITY);
     for (top, shading) in [(1.0, Shading::default()), (0.2, Shading::default())] {
         let look = TransferFunction {
             color_space: ColorSpace::Srgb,

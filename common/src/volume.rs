@@ -1,12 +1,16 @@
 //! A volume: samples on a lattice that has a place in the world.
 
 mod core;
+mod palette;
+
+pub use palette::{COLOURS_MAX, ColourValue, Palette, PaletteError, luminance};
 
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
 use std::convert::Infallible;
+use std::sync::Arc;
 
 /// Lattice of a volume's samples. World units are the file's (mm), world axes anatomical (RAS+)
 /// where the file has them (docs/design/contracts.md, World and camera).
@@ -394,6 +398,10 @@ pub struct ValueSummary {
     /// does not describe the rest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub core: Option<ValueCore>,
+    /// Colours of the voxels, if they have their own. Bricks then hold places in the palette, and all
+    /// above is about the palette's values.
+    #[serde(skip)]
+    pub palette: Option<Arc<Palette>>,
 }
 
 /// The part of a volume's range that holds nearly all of its samples.
@@ -430,6 +438,7 @@ impl ValueSummary {
             infinite: 0,
             anatomical: false,
             core: None,
+            palette: None,
         };
         let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
         for &c in v {
@@ -474,6 +483,7 @@ impl ValueSummary {
             infinite: 0,
             anatomical: false,
             core: None,
+            palette: None,
         };
         for (code, n) in present() {
             let bin = s.bin(code);
@@ -508,6 +518,12 @@ impl ValueSummary {
     #[inline]
     pub fn core_bin(code: f64, lo: f64, hi: f64) -> usize {
         core::bin(code, lo, hi)
+    }
+
+    /// Returns the number type of the codes that bricks hold and uploads send: of places in the palette,
+    /// if there is one.
+    pub fn code_kind(&self) -> SampleKind {
+        if self.palette.is_some() { SampleKind::U16 } else { self.kind }
     }
 
     /// Returns the histogram bin of a finite code, 0 to 255.
@@ -557,12 +573,15 @@ pub struct Volume {
     pub anatomical: bool,
     /// Lattice that the samples lie on.
     pub lattice: Lattice,
-    /// The samples, i fastest, then j, then k.
+    /// The samples, i fastest, then j, then k. Of voxels with colours of their own they are the
+    /// palette's values.
     pub samples: Samples,
-    /// Range, histogram, and map from codes to values. Of a coarser level that of level 0.
+    /// Range, histogram, map from codes to values, and palette. Of a coarser level that of level 0.
     pub summary: ValueSummary,
     /// Place among the levels of detail of a volume; `None` of level 0.
     pub coarse: Option<CoarseLevel>,
+    /// Places of the voxels in the palette, if there is one: 16-bit codes, of the same order.
+    pub places: Option<Samples>,
 }
 
 /// Place of a volume among the levels of detail of a finer one (docs/design/model.md, Levels of
@@ -598,7 +617,45 @@ impl Volume {
             samples,
             summary,
             coarse: None,
+            places: None,
         }
+    }
+
+    /// Returns a volume of voxels with colours of their own: `places` in `palette`.
+    ///
+    /// # Errors
+    /// A place is beyond the palette.
+    ///
+    /// # Panics
+    /// If the lattice and the places differ in number.
+    pub fn coloured(
+        name: impl Into<String>,
+        file_type: impl Into<String>,
+        anatomical: bool,
+        lattice: Lattice,
+        palette: Arc<Palette>,
+        places: Vec<u16>,
+    ) -> Result<Self, PaletteError> {
+        let values = Samples::U8(palette.values(&places)?);
+        let mut volume =
+            Volume::new(name, file_type, anatomical, lattice, values, ValueMap::IDENTITY);
+        // Outliers of brightness are a part of the picture.
+        volume.summary.core = None;
+        volume.summary.palette = Some(palette);
+        volume.places = Some(Samples::U16(places));
+        Ok(volume)
+    }
+
+    /// Returns the codes that voxels are classified by, and that bricks hold and uploads send: places
+    /// in the palette if there is one, else the samples.
+    pub fn codes(&self) -> &Samples {
+        self.places.as_ref().unwrap_or(&self.samples)
+    }
+
+    /// Returns the bytes that the volume's voxels take in memory.
+    pub fn memory_bytes(&self) -> u64 {
+        let places = self.places.as_ref().map_or(0, |_| SampleKind::U16.bytes());
+        (self.samples.len() * (self.samples.kind().bytes() + places)) as u64
     }
 
     /// Returns a volume by formula: `f(i, j, k)` as 8-bit codes on a lattice of unit spacing.
@@ -615,14 +672,15 @@ impl Volume {
         Volume::new(name, "uint8", false, lattice, Samples::U8(v), ValueMap::IDENTITY)
     }
 
-    /// Returns the SHA-256 over lattice, value map and samples; of a coarser level also over what
-    /// level 0 gives it. Two volumes with one digest give the same pictures; the name is not part
+    /// Returns the SHA-256 over lattice, value map, palette and codes; of a coarser level also over
+    /// what level 0 gives it. Two volumes with one digest give the same pictures; the name is not part
     /// of it.
     pub fn digest(&self) -> Digest32 {
-        let mut hasher = VolumeHasher::new(&self.lattice, self.summary.map, self.samples.kind());
-        let count = self.samples.len();
+        let mut hasher = VolumeHasher::of(&self.lattice, &self.summary);
+        let codes = self.codes();
+        let count = codes.len();
         for begin in (0..count).step_by(1 << 15) {
-            hasher.update(&self.samples.le_bytes(begin..count.min(begin + (1 << 15))));
+            hasher.update(&codes.le_bytes(begin..count.min(begin + (1 << 15))));
         }
         match &self.coarse {
             None => hasher.finish(),
@@ -672,8 +730,18 @@ impl Volume {
 pub struct VolumeHasher(Sha256);
 
 impl VolumeHasher {
-    /// Starts the digest of a volume on `lattice` whose codes have type `kind` and stand for the values
-    /// that `map` gives.
+    /// Starts the digest of a volume on `lattice` whose codes have the type, the map to values and the
+    /// palette of `summary`.
+    pub fn of(lattice: &Lattice, summary: &ValueSummary) -> VolumeHasher {
+        let mut hasher = VolumeHasher::new(lattice, summary.map, summary.code_kind());
+        if let Some(palette) = &summary.palette {
+            hasher.update(&palette.digest().0);
+        }
+        hasher
+    }
+
+    /// Starts the digest of a volume without palette on `lattice`, whose codes have type `kind` and stand
+    /// for the values that `map` gives.
     pub fn new(lattice: &Lattice, map: ValueMap, kind: SampleKind) -> VolumeHasher {
         let mut h = Sha256::new();
         h.update(b"slabcast volume 1");

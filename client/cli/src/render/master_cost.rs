@@ -138,7 +138,13 @@ fn what_a_master_in_the_process_takes() {
             let done = match with_master {
                 true => {
                     let crew = WorkerGroup::new(1, Some(threads)).expect("a crew");
-                    runtime.block_on(embedded(run, Arc::new(MemorySource::of(volume)), orientation, crew, None))
+                    runtime.block_on(embedded(
+                        run,
+                        Arc::new(MemorySource::of(volume)),
+                        orientation,
+                        crew,
+                        None,
+                    ))
                 }
                 false => {
                     let how = (threads as usize, told.clone());

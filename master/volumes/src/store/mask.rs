@@ -106,7 +106,8 @@ impl VoxelMask {
             for y in corner[1]..end[1] {
                 let row = (z - self.lo[2]) as usize * self.size[1] + (y - self.lo[1]) as usize;
                 let row = &self.bits[row * self.words..][..self.words];
-                let beyond = if shift == 0 { 0 } else { row.get(word + 1).map_or(0, |w| w << (64 - shift)) };
+                let beyond =
+                    if shift == 0 { 0 } else { row.get(word + 1).map_or(0, |w| w << (64 - shift)) };
                 let mut bits = (row[word] >> shift | beyond) & valid;
                 if bits == 0 {
                     continue;

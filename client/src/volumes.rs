@@ -66,7 +66,9 @@ impl Client {
 
     /// Puts a volume on the master, or finds that it has it. `told` is called with the bytes of samples
     /// that the master has, as they grow. Goes on where it was when the connection breaks, for up to
-    /// two minutes of a master that is away.
+    /// two minutes of a master that is away. `samples` are the volume's codes ([`Volume::codes`]).
+    ///
+    /// [`Volume::codes`]: slabcast_common::volume::Volume::codes
     ///
     /// # Errors
     /// [`ClientError::Volume`] if the master refuses it, with its figures; [`ClientError::UploadStopped`]

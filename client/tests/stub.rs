@@ -178,6 +178,7 @@ fn notice(
 
 fn stats(frame: u64) -> FrameStats {
     FrameStats {
+        level: None,
         v: 1,
         frame,
         schedule: slabcast_common::quality::Schedule::Region,

@@ -2,6 +2,7 @@
 //! never changes a byte). Names are those of docs/design/contracts.md, in flags, JSON and the wire.
 
 use crate::spelling::nearest;
+use crate::volume::ValueSummary;
 use serde::{Deserialize, Serialize};
 
 /// Reconstruction kernel: the function that a voxel stands for (paper section 3).
@@ -182,6 +183,27 @@ impl Quality {
             Classify::After => Quality::default(),
             Classify::Before => Quality::before(),
         }
+    }
+
+    /// Returns the quality in another order of classification: thickness and kernel that have the
+    /// default of their order get that of the other.
+    #[must_use]
+    pub fn in_order(self, classify: Classify) -> Quality {
+        if self.classify == classify {
+            return self;
+        }
+        let (from, to) = (Quality::of(self.classify), Quality::of(classify));
+        let thickness =
+            if self.thickness == from.thickness { to.thickness } else { self.thickness };
+        let kernel = if self.kernel == from.kernel { to.kernel } else { self.kernel };
+        Quality { thickness, kernel, classify, ..self }
+    }
+
+    /// Returns the quality in which a volume is drawn: voxels with colours of their own are always
+    /// classified before reconstruction, since no colour lies between two places of a palette.
+    #[must_use]
+    pub fn for_volume(self, summary: &ValueSummary) -> Quality {
+        if summary.palette.is_some() { self.in_order(Classify::Before) } else { self }
     }
 
     /// Returns standard deviation and support radius of the kernel in lattice steps.

@@ -6,7 +6,7 @@ use crate::gradient::decode_magnitude;
 use crate::math::linear_from_srgb;
 use crate::quality::{Classify, Compositing, InvalidField, Quality, Sums, json_error};
 use crate::shade::Shading;
-use crate::volume::{Lattice, SampleKind, Samples, ValueSummary, VolumeInfo};
+use crate::volume::{Lattice, Palette, SampleKind, Samples, ValueSummary, VolumeInfo};
 use serde::{Deserialize, Serialize};
 
 /// Cap of the extinction per vox: 16 ln 2, an alpha of `1 - 2^-16` (docs/design/model.md section
@@ -251,7 +251,7 @@ impl OpacityRule {
 /// A transfer function made ready for one volume: a lookup table over codes where they are few.
 #[derive(Clone, Debug)]
 pub struct Classifier {
-    /// Optical samples by code (256 or 65536); empty for float volumes.
+    /// Optical samples by code (256, or 65536 of 16 bits or a palette); empty for float volumes.
     table: Vec<OpticalSample>,
     /// `[x, r, g, b]`, linear light.
     colors: Vec<[f64; 4]>,
@@ -316,7 +316,7 @@ impl Classifier {
             ColorSpace::Linear => c,
         };
         let largest = largest_opacity(tf, info);
-        let codes = match summary.kind {
+        let codes = match summary.code_kind() {
             SampleKind::U8 => 256,
             SampleKind::U16 => 65536,
             SampleKind::F32 => 0,
@@ -335,7 +335,7 @@ impl Classifier {
                 rgb: tf.nan.color.map(|c| decode(c) as f32),
             },
             domain: tf.domain,
-            summary,
+            summary: summary.clone(),
             payload_max: rule.payload(largest),
             uncapped: rule.sigma(largest) > SIGMA_MAX && compositing != Compositing::Paper,
             gradient_points: Vec::new(),
@@ -352,8 +352,35 @@ impl Classifier {
             c.gradient_per_share = per_share;
             c.factors = (0..=255).map(|code| c.gradient_factor(decode_magnitude(code))).collect();
         }
-        c.table = (0..codes).map(|code| c.evaluate(code as f64)).collect();
+        c.table = match summary.palette.clone() {
+            Some(palette) => c.looks_of(&palette, codes),
+            None => (0..codes).map(|code| c.evaluate(code as f64)).collect(),
+        };
         c
+    }
+
+    /// Returns the looks of a palette's codes: opacity by the colour's value, colour by the palette.
+    /// Codes beyond it have none.
+    fn looks_of(&self, palette: &Palette, codes: usize) -> Vec<OpticalSample> {
+        let linear: Vec<f32> =
+            (0..=255).map(|c| linear_from_srgb(f64::from(c) / 255.0) as f32).collect();
+        let sigmas: Vec<f32> = (0..=255).map(|v| self.evaluate(f64::from(v)).sigma).collect();
+        let look = |&colour: &[u8; 4]| OpticalSample {
+            sigma: sigmas[usize::from(palette.value().of(colour))],
+            rgb: std::array::from_fn(|c| linear[usize::from(colour[c])]),
+        };
+        let mut looks: Vec<OpticalSample> = palette.colours().iter().map(look).collect();
+        looks.resize(codes, OpticalSample::default());
+        looks
+    }
+
+    /// Returns the value, as a code of the volume's samples, of a code that bricks hold.
+    #[inline]
+    fn value_code(&self, code: f64) -> f64 {
+        match &self.summary.palette {
+            Some(palette) => f64::from(palette.value_of(code as u16)),
+            None => code,
+        }
     }
 
     /// Returns the x of the transfer function at a finite code.
@@ -418,7 +445,7 @@ impl Classifier {
     }
 
     fn modulated(&self, look: OpticalSample, brick: &Brick, i: usize) -> OpticalSample {
-        let code = brick.values.code(i);
+        let code = self.value_code(brick.values.code(i));
         // Not a number has no border either.
         if code.is_nan() || look.sigma == 0.0 {
             return look;
@@ -499,7 +526,7 @@ impl Classifier {
             return None;
         }
         let occurs = |code: usize| {
-            let code = code as f64;
+            let code = self.value_code(code as f64);
             let range = self.summary.min_code..=self.summary.max_code;
             range.contains(&code) && self.summary.histogram[self.summary.bin(code)] > 0
         };

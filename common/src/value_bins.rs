@@ -18,11 +18,13 @@ pub struct ValueBins {
 }
 
 impl ValueBins {
-    /// Returns bins over the values that nearly all samples have.
+    /// Returns bins over the values that nearly all samples have; of colours over the places in their
+    /// palette.
     pub fn of(summary: &ValueSummary) -> ValueBins {
-        let (lo, hi) = match &summary.core {
-            Some(core) => (core.min_code, core.max_code),
-            None => (summary.min_code, summary.max_code),
+        let (lo, hi) = match (&summary.palette, &summary.core) {
+            (Some(palette), _) => (0.0, palette.colours().len() as f64),
+            (None, Some(core)) => (core.min_code, core.max_code),
+            (None, None) => (summary.min_code, summary.max_code),
         };
         let width = (hi - lo) / 64.0;
         ValueBins { first_code: lo, width: if width > 0.0 { width } else { 1.0 } }

@@ -1,191 +1,18 @@
 //! A volume: samples on a lattice that has a place in the world.
 
 mod core;
+mod lattice;
+mod palette;
+
+pub use lattice::{Lattice, LatticeError};
+pub use palette::{COLOURS_MAX, ColourValue, Palette, PaletteError, luminance};
 
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
 use std::convert::Infallible;
-
-/// Lattice of a volume's samples. World units are the file's (mm), world axes anatomical (RAS+)
-/// where the file has them (docs/design/contracts.md, World and camera).
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Lattice {
-    /// Samples along the index axes i, j, k (i fastest).
-    pub dims: [u32; 3],
-    /// World vectors of one step along each index axis, in world units.
-    pub steps: [DVec3; 3],
-    /// World position of sample (0, 0, 0), in world units.
-    pub origin: DVec3,
-}
-
-impl Lattice {
-    /// Returns a lattice along the world axes, `spacing` world units a step, with its first sample
-    /// at the world's origin.
-    pub fn from_spacing(dims: [u32; 3], spacing: [f64; 3]) -> Self {
-        Lattice {
-            dims,
-            steps: [
-                DVec3::new(spacing[0], 0.0, 0.0),
-                DVec3::new(0.0, spacing[1], 0.0),
-                DVec3::new(0.0, 0.0, spacing[2]),
-            ],
-            origin: DVec3::ZERO,
-        }
-    }
-
-    /// Returns the number of samples on the lattice.
-    pub fn len(&self) -> usize {
-        self.dims.iter().map(|&n| n as usize).product()
-    }
-
-    /// Returns whether the lattice has no sample.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// Returns the lengths of the steps along i, j, k in world units.
-    pub fn spacing(&self) -> [f64; 3] {
-        self.steps.map(|s| s.length())
-    }
-
-    /// Returns the length of one vox, the smallest spacing, in world units.
-    pub fn vox(&self) -> f64 {
-        let [a, b, c] = self.spacing();
-        a.min(b).min(c)
-    }
-
-    /// Returns the matrix from index to world coordinates, without the translation by the origin.
-    pub fn world_from_index(&self) -> DMat3 {
-        DMat3::from_cols(self.steps[0], self.steps[1], self.steps[2])
-    }
-
-    /// Returns the matrix that [`Volume::gradient`] takes: the transposed inverse of
-    /// `world_from_index`, scaled to vox so that no unit overflows it.
-    ///
-    /// Its numbers are rounded to f32. Gradients of integers are fractions of small numbers, and
-    /// some lie just between two codes of a normal. In another unit of length the matrix has other
-    /// last bits, and one gradient in 10^4 or so would flip to the next code (the test below counts
-    /// 44 in 5 10^5 without the rounding; two voxels make 1 % of a small picture differ).
-    pub fn gradient_matrix(&self) -> DMat3 {
-        let vox = self.vox();
-        let m = DMat3::from_cols(self.steps[0] / vox, self.steps[1] / vox, self.steps[2] / vox);
-        let m = m.inverse().transpose();
-        DMat3::from_cols_array(&m.to_cols_array().map(|x| f64::from(x as f32)))
-    }
-
-    /// Returns the index coordinates of the centre of the volume's box.
-    pub fn centre_index(&self) -> DVec3 {
-        let [x, y, z] = self.dims.map(|n| (n as f64 - 1.0) / 2.0);
-        DVec3::new(x, y, z)
-    }
-
-    /// Returns the world position of the centre of the volume's box.
-    pub fn centre(&self) -> DVec3 {
-        self.origin + self.world_from_index() * self.centre_index()
-    }
-
-    /// Returns the world vector from the centre of this lattice's box to that of `other`, which is
-    /// another level of the same volume.
-    ///
-    /// Rounded to 1/65536 of a step, so that a far origin leaves no noise in it.
-    pub fn to_centre_of(&self, other: &Lattice) -> DVec3 {
-        let between = (other.origin - self.origin)
-            + (other.world_from_index() * other.centre_index()
-                - self.world_from_index() * self.centre_index());
-        let steps = self.world_from_index().inverse() * between;
-        self.world_from_index() * ((steps * 65536.0).round() / 65536.0)
-    }
-
-    /// Returns the largest extent in world units (N samples count as N spacings).
-    pub fn largest_extent(&self) -> f64 {
-        let s = self.spacing();
-        (0..3).map(|a| s[a] * self.dims[a] as f64).fold(0.0, f64::max)
-    }
-
-    /// Returns the longest way through the volume, from corner to corner, in world units (N samples
-    /// count as N spacings).
-    pub fn diagonal(&self) -> f64 {
-        let [a, b, c] = [0, 1, 2].map(|i| self.steps[i] * f64::from(self.dims[i]));
-        [a + b + c, a + b - c, a - b + c, -a + b + c]
-            .map(DVec3::length)
-            .into_iter()
-            .fold(0.0, f64::max)
-    }
-
-    /// Returns whether the lattice is cubic: equal spacings and right angles, to 1 part in 1000
-    /// (files carry spacings rounded to some digits). The kernel of other lattices is an ellipsoid
-    /// ([`crate::kernel`]).
-    pub fn is_isotropic(&self) -> bool {
-        let s = self.spacing();
-        let vox = self.vox();
-        let right = |a: DVec3, b: DVec3| a.dot(b).abs() <= 1e-3 * a.length() * b.length();
-        s.iter().all(|&x| x <= vox * 1.001)
-            && right(self.steps[0], self.steps[1])
-            && right(self.steps[0], self.steps[2])
-            && right(self.steps[1], self.steps[2])
-    }
-
-    /// Checks that the lattice can be drawn.
-    ///
-    /// # Errors
-    /// If a dimension is zero, a number is not finite, a step has no length, two axes coincide, or
-    /// spacings differ by more than a factor of 10^6.
-    pub fn check(&self) -> Result<(), LatticeError> {
-        let s = self.spacing();
-        if self.dims.contains(&0) {
-            return Err(LatticeError::ZeroDimension(self.dims));
-        }
-        if !self.steps.iter().all(|v| v.is_finite()) || !self.origin.is_finite() {
-            return Err(LatticeError::NotFinite);
-        }
-        if s.iter().any(|x| x.is_infinite()) {
-            return Err(LatticeError::HugeSpacing);
-        }
-        if s.iter().any(|&x| x <= 0.0 || !x.is_normal()) {
-            return Err(LatticeError::ZeroSpacing(s));
-        }
-        let u = DMat3::from_cols(self.steps[0] / s[0], self.steps[1] / s[1], self.steps[2] / s[2]);
-        if u.determinant().abs() < 1e-6 {
-            return Err(LatticeError::Flat);
-        }
-        let ratio = s.iter().copied().fold(0.0, f64::max) / self.vox();
-        if ratio > 1e6 {
-            return Err(LatticeError::UnequalSpacings(ratio));
-        }
-        Ok(())
-    }
-}
-
-/// Why a lattice can't be drawn.
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-pub enum LatticeError {
-    /// An axis has no sample. Holds the dimensions.
-    #[error("a dimension is zero ({0:?})")]
-    ZeroDimension([u32; 3]),
-    /// A step or the origin is infinite or NaN.
-    #[error("spacing or origin is not finite")]
-    NotFinite,
-    /// A step has no length, or a denormal one. Holds the spacings in world units.
-    #[error("a spacing is zero or too small ({0:?})")]
-    ZeroSpacing([f64; 3]),
-    /// A step is so long that its square is no number.
-    #[error("a spacing is too large (above 1e154)")]
-    HugeSpacing,
-    /// Two index axes coincide.
-    #[error("two index axes point the same way; the volume would be flat")]
-    Flat,
-    /// Spacings differ too much. Holds the largest over the smallest.
-    #[error("spacings differ by a factor of {0:.3e}; at most 1e6")]
-    UnequalSpacings(f64),
-}
-
-impl From<LatticeError> for String {
-    fn from(error: LatticeError) -> String {
-        error.to_string()
-    }
-}
+use std::sync::Arc;
 
 /// Samples as stored: in the file's type where it has at most 16 bits, else as f32.
 #[derive(Clone, Debug, PartialEq)]
@@ -394,6 +221,10 @@ pub struct ValueSummary {
     /// does not describe the rest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub core: Option<ValueCore>,
+    /// Colours of the voxels, if they have their own. Bricks then hold places in the palette, and all
+    /// above is about the palette's values.
+    #[serde(skip)]
+    pub palette: Option<Arc<Palette>>,
 }
 
 /// The part of a volume's range that holds nearly all of its samples.
@@ -430,6 +261,7 @@ impl ValueSummary {
             infinite: 0,
             anatomical: false,
             core: None,
+            palette: None,
         };
         let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
         for &c in v {
@@ -474,6 +306,7 @@ impl ValueSummary {
             infinite: 0,
             anatomical: false,
             core: None,
+            palette: None,
         };
         for (code, n) in present() {
             let bin = s.bin(code);
@@ -508,6 +341,12 @@ impl ValueSummary {
     #[inline]
     pub fn core_bin(code: f64, lo: f64, hi: f64) -> usize {
         core::bin(code, lo, hi)
+    }
+
+    /// Returns the number type of the codes that bricks hold and uploads send: of places in the palette,
+    /// if there is one.
+    pub fn code_kind(&self) -> SampleKind {
+        if self.palette.is_some() { SampleKind::U16 } else { self.kind }
     }
 
     /// Returns the histogram bin of a finite code, 0 to 255.
@@ -557,12 +396,15 @@ pub struct Volume {
     pub anatomical: bool,
     /// Lattice that the samples lie on.
     pub lattice: Lattice,
-    /// The samples, i fastest, then j, then k.
+    /// The samples, i fastest, then j, then k. Of voxels with colours of their own they are the
+    /// palette's values.
     pub samples: Samples,
-    /// Range, histogram, and map from codes to values. Of a coarser level that of level 0.
+    /// Range, histogram, map from codes to values, and palette. Of a coarser level that of level 0.
     pub summary: ValueSummary,
     /// Place among the levels of detail of a volume; `None` of level 0.
     pub coarse: Option<CoarseLevel>,
+    /// Places of the voxels in the palette, if there is one: 16-bit codes, of the same order.
+    pub places: Option<Samples>,
 }
 
 /// Place of a volume among the levels of detail of a finer one (docs/design/model.md, Levels of
@@ -598,7 +440,45 @@ impl Volume {
             samples,
             summary,
             coarse: None,
+            places: None,
         }
+    }
+
+    /// Returns a volume of voxels with colours of their own: `places` in `palette`.
+    ///
+    /// # Errors
+    /// A place is beyond the palette.
+    ///
+    /// # Panics
+    /// If the lattice and the places differ in number.
+    pub fn coloured(
+        name: impl Into<String>,
+        file_type: impl Into<String>,
+        anatomical: bool,
+        lattice: Lattice,
+        palette: Arc<Palette>,
+        places: Vec<u16>,
+    ) -> Result<Self, PaletteError> {
+        let values = Samples::U8(palette.values(&places)?);
+        let mut volume =
+            Volume::new(name, file_type, anatomical, lattice, values, ValueMap::IDENTITY);
+        // Outliers of brightness are a part of the picture.
+        volume.summary.core = None;
+        volume.summary.palette = Some(palette);
+        volume.places = Some(Samples::U16(places));
+        Ok(volume)
+    }
+
+    /// Returns the codes that voxels are classified by, and that bricks hold and uploads send: places
+    /// in the palette if there is one, else the samples.
+    pub fn codes(&self) -> &Samples {
+        self.places.as_ref().unwrap_or(&self.samples)
+    }
+
+    /// Returns the bytes that the volume's voxels take in memory.
+    pub fn memory_bytes(&self) -> u64 {
+        let places = self.places.as_ref().map_or(0, |_| SampleKind::U16.bytes());
+        (self.samples.len() * (self.samples.kind().bytes() + places)) as u64
     }
 
     /// Returns a volume by formula: `f(i, j, k)` as 8-bit codes on a lattice of unit spacing.
@@ -615,14 +495,15 @@ impl Volume {
         Volume::new(name, "uint8", false, lattice, Samples::U8(v), ValueMap::IDENTITY)
     }
 
-    /// Returns the SHA-256 over lattice, value map and samples; of a coarser level also over what
-    /// level 0 gives it. Two volumes with one digest give the same pictures; the name is not part
+    /// Returns the SHA-256 over lattice, value map, palette and codes; of a coarser level also over
+    /// what level 0 gives it. Two volumes with one digest give the same pictures; the name is not part
     /// of it.
     pub fn digest(&self) -> Digest32 {
-        let mut hasher = VolumeHasher::new(&self.lattice, self.summary.map, self.samples.kind());
-        let count = self.samples.len();
+        let mut hasher = VolumeHasher::of(&self.lattice, &self.summary);
+        let codes = self.codes();
+        let count = codes.len();
         for begin in (0..count).step_by(1 << 15) {
-            hasher.update(&self.samples.le_bytes(begin..count.min(begin + (1 << 15))));
+            hasher.update(&codes.le_bytes(begin..count.min(begin + (1 << 15))));
         }
         match &self.coarse {
             None => hasher.finish(),
@@ -672,8 +553,18 @@ impl Volume {
 pub struct VolumeHasher(Sha256);
 
 impl VolumeHasher {
-    /// Starts the digest of a volume on `lattice` whose codes have type `kind` and stand for the values
-    /// that `map` gives.
+    /// Starts the digest of a volume on `lattice` whose codes have the type, the map to values and the
+    /// palette of `summary`.
+    pub fn of(lattice: &Lattice, summary: &ValueSummary) -> VolumeHasher {
+        let mut hasher = VolumeHasher::new(lattice, summary.map, summary.code_kind());
+        if let Some(palette) = &summary.palette {
+            hasher.update(&palette.digest().0);
+        }
+        hasher
+    }
+
+    /// Starts the digest of a volume without palette on `lattice`, whose codes have type `kind` and stand
+    /// for the values that `map` gives.
     pub fn new(lattice: &Lattice, map: ValueMap, kind: SampleKind) -> VolumeHasher {
         let mut h = Sha256::new();
         h.update(b"slabcast volume 1");

@@ -115,7 +115,7 @@ fn sums_bytes(schedule: Schedule, hashed: bool) -> u64 {
 /// Returns an upper bound of the bytes of a brick set.
 pub(crate) fn brick_set_bytes(volume: &VolumeInfo, needs: &BrickNeeds) -> u64 {
     let voxels: u64 = volume.lattice.dims.iter().map(|&n| u64::from(n)).product();
-    let sample = volume.summary.kind.bytes() as u64;
+    let sample = volume.summary.code_kind().bytes() as u64;
     // A voxel's index within its brick takes up to two bytes.
     voxels * (2 + sample + 2 * u64::from(needs.normals) + u64::from(needs.gradients))
 }

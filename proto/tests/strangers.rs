@@ -442,3 +442,41 @@ fn bytes_of_hello_and_refused_never_change() {
     ];
     assert_eq!(ControlResponse { message: Some(refused) }.encode_to_vec(), golden);
 }
+
+#[test]
+fn wrong_palette_is_refused_by_field_before_memory_is_set_aside() {
+    use slabcast_common::volume::{ColourValue, Lattice, Palette, Volume};
+    let palette =
+        Palette::sorted(vec![[1, 2, 3, 255], [9, 8, 7, 255]], false, ColourValue::Luminance);
+    let lattice = Lattice::from_spacing([2, 1, 1], [1.0; 3]);
+    let volume =
+        Volume::coloured("c", "RGB uint8", false, lattice, palette.unwrap().into(), vec![0, 1]);
+    let volume = volume.unwrap();
+    let header = slabcast_proto::model::VolumeHeader {
+        name: "c".into(),
+        file_type: "RGB uint8".into(),
+        info: volume.info(volume.digest()),
+        orientation: slabcast_scene::path::Orientation::new(None, None).unwrap(),
+    };
+    let good = convert::volume_header_to_wire(&header);
+    assert_eq!(convert::volume_header_from_wire(good.clone()).unwrap().info, header.info);
+    let refused = |change: &dyn Fn(&mut render_v1::Volume)| {
+        let mut wrong = good.clone();
+        change(wrong.volume.as_mut().unwrap());
+        convert::volume_header_from_wire(wrong).unwrap_err().to_string()
+    };
+    let colours = |bytes: Vec<u8>| {
+        refused(&move |v| v.palette.as_mut().unwrap().colours = bytes.clone().into())
+    };
+    assert!(colours(vec![]).contains("volume.palette.colours: has 0 colours"));
+    assert!(colours(vec![1, 2, 3]).contains("3 bytes, which are not four a colour"));
+    assert!(colours(vec![0; 4 * 65_537]).contains("has 65537 colours"));
+    assert!(colours(vec![9, 8, 7, 255, 1, 2, 3, 255]).contains("colour 1 is not above"));
+    assert!(colours(vec![1, 2, 3, 4]).contains("has alphas"));
+    let by_alpha = refused(&|v| v.palette.as_mut().unwrap().value_is_alpha = true);
+    assert!(by_alpha.contains("has alphas"), "{by_alpha}");
+    let kind = refused(&|v| v.sample_kind = render_v1::SampleKind::U16 as i32);
+    assert!(kind.contains("volume.palette: is there, but"), "{kind}");
+    let map = refused(&|v| v.value_scale = Some(2.0));
+    assert!(map.contains("volume.palette: is there, but"), "{map}");
+}

@@ -155,10 +155,11 @@ fn halves(args: &CompareArgs, mut request: RenderRequest) -> Result<[Half; 2], F
         let volume = args.input.open(file)?;
         let info = volume.info(volume.digest());
         let orientation = args.scene.view.axes.for_volume(&volume)?;
-        request.fit(&info, orientation, volume.anatomical)?;
+        let mut own = request.clone();
+        own.fit(&info, orientation, volume.anatomical)?;
         let transfer = request.transfer.function(&info).map_err(|e| request.blame(&e))?;
         let name = if stem(file) == stem(other) { file.display().to_string() } else { stem(file) };
-        let (volume, own) = (Arc::new(volume), request.clone());
+        let volume = Arc::new(volume);
         if both.is_empty() {
             request.transfer = request.transfer.fitted_to(&info).map_err(|e| request.blame(&e))?;
         }

@@ -117,7 +117,7 @@ fn levels(path: &std::path::Path) -> Vec<([u64; 3], [f64; 3])> {
 /// Samples that are visible under each preset.
 fn shares(volume: &Volume, info: &VolumeInfo) -> Result<Vec<Share>, Fail> {
     // Samples of few codes are counted once, for all presets.
-    let counts = volume.samples.code_counts();
+    let counts = volume.codes().code_counts();
     presets::NAMES
         .iter()
         .map(|&(name, what)| {
@@ -134,7 +134,8 @@ fn shares(volume: &Volume, info: &VolumeInfo) -> Result<Vec<Share>, Fail> {
                     .filter(|&i| c.classify(samples, i).sigma > 0.0)
                     .count() as u64,
             };
-            let each = 2 + info.summary.kind.bytes() as u64 + if tf.shading.on { 2 } else { 0 };
+            let each =
+                2 + info.summary.code_kind().bytes() as u64 + if tf.shading.on { 2 } else { 0 };
             Ok(Share { name, what, voxels, bytes: voxels * each })
         })
         .collect()
@@ -222,11 +223,6 @@ fn fitted_to(s: &ValueSummary) -> String {
 const MASTER_BASE: u64 = 60 << 20;
 const WORKER_BASE: u64 = 30 << 20;
 
-/// Bytes of the samples in memory.
-fn sample_bytes(info: &VolumeInfo) -> u64 {
-    info.lattice.len() as u64 * info.summary.kind.bytes() as u64
-}
-
 fn text(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) -> String {
     let lattice = &info.lattice;
     let s = &info.summary;
@@ -283,6 +279,11 @@ fn text(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
             number(s.map.scale)
         );
     }
+    if let Some(palette) = &s.palette {
+        let colours = palette.colours().len();
+        row("colours", format!("{}, 8 bits; {colours} of them", palette.channels_name()));
+        let _ = write!(values, ", the {} that opacity follows", palette.value().name());
+    }
     row("values", values);
     if s.nan + s.infinite > 0 {
         row("", format!("{} NaN, {} infinite", s.nan, s.infinite));
@@ -310,7 +311,7 @@ fn text(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
         out,
         "{:<12} master about {}, each worker up to {} for --tf auto at 512x512",
         "memory",
-        bytes(sample_bytes(info) + auto + MASTER_BASE),
+        bytes(volume.memory_bytes() + auto + MASTER_BASE),
         bytes(auto + WORKER_BASE),
     );
     out
@@ -347,6 +348,10 @@ fn json(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
             "air_ends": presets::air_end(s),
             "histogram": s.histogram,
         },
+        "colours": s.palette.as_ref().map(|palette| serde_json::json!({
+            "channels": palette.channels_name(), "bits": 8, "count": palette.colours().len(),
+            "opacity_by": palette.value().name(),
+        })),
         "presets_by": presets_by(s),
         "bricks": { "edge": 8, "count": grid.len(), "voxels": BRICK_VOXELS },
         "presets": shares.iter().map(|p| serde_json::json!({
@@ -354,7 +359,7 @@ fn json(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
             "share": p.voxels as f64 / total as f64, "brick_bytes": p.bytes,
         })).collect::<Vec<_>>(),
         "memory_bytes": {
-            "samples": sample_bytes(info),
+            "samples": volume.memory_bytes(),
             "bricks_auto": shares.first().map_or(0, |s| s.bytes),
         },
     })

@@ -126,8 +126,8 @@ fn in_turn(variants: [(&Variant, Quality); 2], threads: usize) -> Result<([f64; 
 
 /// Measures what the scene leaves out and what that saves.
 pub(crate) fn measure(of: &VolumeSceneArgs, threads: usize) -> Result<Savings, Fail> {
-    let request = of.request(Work::default())?;
-    let OpenedVolume { volume, info, orientation } = of.open(&request)?;
+    let mut request = of.request(Work::default())?;
+    let OpenedVolume { volume, info, orientation } = of.open(&mut request)?;
     let mut progress = Progress::new(false);
     progress.phase("drawing with and without");
     let variant = |keep| Variant::new(&volume, &info, &request, orientation, keep);

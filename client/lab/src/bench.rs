@@ -63,7 +63,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     let work = Work { keep: args.keep.keep(), ..Work::default() };
     let mut request = args.of.request_with_target(work)?;
     let threads = args.threads.count();
-    let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
+    let OpenedVolume { volume, info, orientation } = args.of.open(&mut request)?;
     let volume = Arc::new(volume);
     settle(&volume, &info, &mut request, orientation, threads)?;
     let scenes = PathScenes::new(&volume, &info, &request, orientation)?;

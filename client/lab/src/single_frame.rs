@@ -38,7 +38,7 @@ impl SingleFrame {
     ) -> Result<SingleFrame, Fail> {
         let mut request = args.request_with_target(Work::default())?;
         check(request.path.size)?;
-        let OpenedVolume { volume, info, orientation } = args.open(&request)?;
+        let OpenedVolume { volume, info, orientation } = args.open(&mut request)?;
         let volume = Arc::new(volume);
         settle(&volume, &info, &mut request, orientation, threads)?;
         let scenes = PathScenes::new(&volume, &info, &request, orientation)?;
@@ -54,7 +54,7 @@ impl SingleFrame {
         args: &VolumeSceneArgs,
     ) -> Result<Option<SingleFrame>, Fail> {
         let mut request = args.request_with_target(Work::default())?;
-        let OpenedVolume { volume, info, orientation } = args.open(&request)?;
+        let OpenedVolume { volume, info, orientation } = args.open(&mut request)?;
         if self.spec.volume.level == info.level {
             return Ok(None);
         }

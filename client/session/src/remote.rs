@@ -78,15 +78,16 @@ pub async fn put(
 ) -> Result<VolumeDescription, Fail> {
     let info = volume.info(volume.digest());
     let digest = info.digest;
-    let total = (volume.samples.len() * volume.samples.kind().bytes()) as u64;
+    let codes = volume.codes();
+    let total = (codes.len() * codes.kind().bytes()) as u64;
     let file_type = volume.file_type.clone();
     let mut header = VolumeHeader { name: name.to_owned(), file_type, info, orientation };
-    let mut put = client.put_volume(&header, &volume.samples, |there| told(there, total)).await;
+    let mut put = client.put_volume(&header, codes, |there| told(there, total)).await;
     if let Err(ClientError::Volume { reason: Reason::VolumeNameTaken, .. }) = put
         && !is_chosen
     {
         header.name = format!("{name}-{}", &digest.to_string()[..8]);
-        put = client.put_volume(&header, &volume.samples, |there| told(there, total)).await;
+        put = client.put_volume(&header, codes, |there| told(there, total)).await;
     }
     put.map_err(|e| client_failure(&e))?;
     describe(client, &VolumeChoice::Digest(digest)).await

@@ -201,6 +201,11 @@ impl Transfer {
             }
             TransferChoice::Function(tf) => (**tf).clone(),
         };
+        if self.colours.is_some() && info.summary.palette.is_some() {
+            let problem = "the voxels have colours of their own; leave it out, or take one of their \
+                           numbers with --channel";
+            return Err(InvalidField::new("--colors", problem));
+        }
         if let Some(colours) = &self.colours {
             let (from, to) = shown(&tf, info);
             tf.colors = presets::stretch_colours(colours, from, to);

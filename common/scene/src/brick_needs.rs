@@ -46,7 +46,7 @@ impl BrickNeeds {
     /// Returns what one transfer function sees of the whole volume.
     pub fn for_transfer(tf: &TransferFunction, info: &VolumeInfo, quality: &Quality) -> BrickNeeds {
         let classifier = Classifier::new(tf, info, quality.compositing);
-        match quality.classify {
+        match quality.for_volume(&info.summary).classify {
             Classify::Before => BrickNeeds {
                 support: classifier.support(),
                 normals: tf.shading.on,

@@ -1,7 +1,7 @@
 use super::*;
 use crate::math::srgb_from_linear;
 use crate::quality::Kernel;
-use crate::volume::{Digest32, ValueMap, Volume};
+use crate::volume::{ColourValue, Digest32, ValueMap, Volume};
 use proptest::prelude::*;
 
 fn info(samples: Samples) -> VolumeInfo {
@@ -268,4 +268,51 @@ fn a_smaller_support_is_covered() {
     assert!(!big.covers(&across));
     assert!(big.union(&across).covers(&across) && big.union(&across).covers(&big));
     assert_eq!(big.union(&across).intervals, [(10.0, 255.0)]);
+}
+
+fn coloured(colours: Vec<[u8; 4]>, alpha: bool) -> VolumeInfo {
+    let value = if alpha { ColourValue::Alpha } else { ColourValue::Luminance };
+    let palette = Palette::sorted(colours, alpha, value).unwrap();
+    let places: Vec<u16> = (0..palette.colours().len() as u16).collect();
+    let lattice = Lattice::from_spacing([places.len() as u32, 1, 1], [1.0; 3]);
+    let v = Volume::coloured("c", "RGB uint8", false, lattice, palette.into(), places).unwrap();
+    v.info(v.digest())
+}
+
+#[test]
+fn colours_have_their_own_colour_and_the_opacity_of_their_value() {
+    let tf = tf(vec![[20.0, 0.0], [100.0, 0.8]]);
+    let (red, green, black) = ([255, 0, 0, 255], [0, 255, 128, 255], [0, 0, 0, 255]);
+    let info = coloured(vec![green, red, black], false);
+    assert_eq!((info.summary.min_code, info.summary.max_code), (0.0, 165.0));
+    assert_eq!(info.summary.code_kind(), SampleKind::U16);
+    let c = Classifier::new(&tf, &info, Compositing::Paper);
+    let look = |place: u16| c.classify(&Samples::U16(vec![place]), 0);
+    assert_eq!((look(0).sigma, look(1).rgb), (0.0, [1.0, 0.0, 0.0]));
+    // Red has luminance 77.
+    assert!((look(1).sigma - 0.8 * 57.0 / 80.0).abs() < 1e-6);
+    assert!((look(2).sigma - 0.8).abs() < 1e-6);
+    let half = linear_from_srgb(128.0 / 255.0) as f32;
+    assert_eq!(look(2).rgb, [0.0, 1.0, half]);
+    assert_eq!(look(3), OpticalSample::default(), "nothing lies beyond the palette");
+    assert_eq!(c.classify_bits(65_535), OpticalSample::default());
+    assert_eq!(c.support().intervals, [(1.0, 2.0)]);
+    assert!(c.choose_sums(&Quality::before(), &info.lattice).is_ok());
+
+    let info = coloured(vec![[9, 9, 9, 0], [200, 9, 9, 60], [9, 9, 200, 255]], true);
+    let c = Classifier::new(&tf, &info, Compositing::Paper);
+    let sigmas = [0, 1, 2].map(|place| c.classify(&Samples::U16(vec![place]), 0).sigma);
+    assert!(sigmas[0] == 0.0 && (sigmas[1] - 0.4).abs() < 1e-6 && (sigmas[2] - 0.8).abs() < 1e-6);
+}
+
+#[test]
+fn quality_of_colours_is_classified_before_and_keeps_what_was_asked() {
+    let colours = coloured(vec![[1, 2, 3, 255]], false).summary;
+    assert_eq!(Quality::default().for_volume(&colours), Quality::before());
+    let asked = Quality { thickness: 0.25, eps: 0.1, ..Quality::default() };
+    let drawn = asked.for_volume(&colours);
+    assert_eq!((drawn.thickness, drawn.eps, drawn.kernel), (0.25, 0.1, Kernel::Gaussian));
+    assert_eq!(drawn.classify, Classify::Before);
+    let grey = info(Samples::U8(vec![1, 2])).summary;
+    assert_eq!(asked.for_volume(&grey), asked);
 }

@@ -66,3 +66,25 @@ fn spacing_too_large_for_a_number_is_not_called_zero() {
     assert_eq!(e, LatticeError::HugeSpacing);
     assert!(e.to_string().contains("too large"), "{e}");
 }
+
+#[test]
+fn colours_are_part_of_the_digest_and_their_values_are_the_samples() {
+    let of = |colours: Vec<[u8; 4]>, places: Vec<u16>| {
+        let palette = Palette::new(colours, false, ColourValue::Luminance).unwrap();
+        let lattice = Lattice::from_spacing([2, 1, 1], [1.0; 3]);
+        Volume::coloured("c", "RGB uint8", false, lattice, palette.into(), places)
+    };
+    let (dark, red) = ([1, 1, 1, 255], [255, 0, 0, 255]);
+    let volume = of(vec![dark, red], vec![1, 0]).unwrap();
+    assert_eq!(volume.samples, Samples::U8(vec![77, 1]));
+    assert_eq!(volume.codes(), &Samples::U16(vec![1, 0]));
+    assert_eq!(volume.memory_bytes(), 6);
+    let others = [
+        of(vec![dark, red], vec![0, 1]).unwrap(),
+        of(vec![dark, [255, 0, 1, 255]], vec![1, 0]).unwrap(),
+        Volume::new("c", "t", false, volume.lattice, volume.samples.clone(), ValueMap::IDENTITY),
+        Volume::new("c", "t", false, volume.lattice, volume.codes().clone(), ValueMap::IDENTITY),
+    ];
+    assert!(others.iter().all(|other| other.digest() != volume.digest()));
+    assert_eq!(of(vec![dark, red], vec![0, 2]).unwrap_err(), PaletteError::Code(2));
+}

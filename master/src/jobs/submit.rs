@@ -90,6 +90,8 @@ pub(crate) struct Plan {
 /// The views of a path, each made when it is asked for.
 pub(crate) struct Views {
     request: Arc<PathRequest>,
+    /// Quality of the views: the request's, as the volume has it.
+    quality: Quality,
     /// The path with the numbers of its framing, if it asked for them.
     framed: Option<Box<ViewPath>>,
     prepared: Prepared,
@@ -115,7 +117,7 @@ impl Views {
     pub(crate) fn view(&self, number: u64, info: &VolumeInfo) -> Result<View, InvalidField> {
         let mut camera = self.prepared.camera(self.path(), number as usize)?;
         camera.target -= self.to_level;
-        View::new(&info.lattice, &camera, self.request.path.size, &self.request.quality)
+        View::new(&info.lattice, &camera, self.request.path.size, &self.quality)
     }
 
     /// Tries views: all that were given, else [`TRIED_VIEWS`] of the path. Calls `each` with them.
@@ -161,7 +163,8 @@ impl Plan {
     ) -> Result<Plan, SubmitError> {
         let served = &*open.served;
         let asked = &served.info;
-        request.quality.check()?;
+        let quality = request.quality.for_volume(&asked.summary);
+        quality.check()?;
         request.work.check()?;
         request.path.check()?;
         shares.check(&request)?;
@@ -179,7 +182,7 @@ impl Plan {
         let path = framed.as_deref().unwrap_or(&request.path);
         let prepared = path.prepare(&asked.lattice, served.orientation)?.into_prepared();
         let to_level = DVec3::ZERO;
-        let mut views = Views { request: request.clone(), framed, prepared, to_level };
+        let mut views = Views { request: request.clone(), quality, framed, prepared, to_level };
         let mut finest = AutoLevel::new(asked);
         views.check(asked, |view| finest.see(view))?;
         let level = match request.level {
@@ -194,8 +197,8 @@ impl Plan {
         }
         // The interpolating spline filters all samples of a level, so a file keeps the other.
         let quality = match drawn.source.whole(drawn.level) {
-            Some(_) => quality_at_level(request.quality, info.level - asked.level),
-            None => request.quality,
+            Some(_) => quality_at_level(quality, info.level - asked.level),
+            None => quality,
         };
         let compositing = quality.compositing;
         let tween = Tween::from_path(&request.path, &asked.summary)?;

@@ -29,8 +29,8 @@ fn lattices(lattice: &Lattice) -> impl Iterator<Item = Lattice> {
 }
 
 impl Library {
-    /// Returns a level of a volume; of a volume with fewer levels the coarsest, and of one that is
-    /// itself a coarser level its own. A file's own levels are taken as they are; others are computed
+    /// Returns a level of a volume; of a volume with fewer levels the coarsest (colours have one), and
+    /// of one that is itself a coarser level its own. A file's own levels are taken as they are; others are computed
     /// from a volume in memory.
     ///
     /// # Errors
@@ -44,6 +44,9 @@ impl Library {
             return Ok(OpenVolume::of(open.source.clone(), found, name, *orientation));
         };
         let info = &open.served.info;
+        if info.summary.palette.is_some() {
+            return Ok(open.clone());
+        }
         let steps = level.saturating_sub(info.level) as usize;
         let Some(lattice) = lattices(&info.lattice).take(steps + 1).last() else {
             return Ok(open.clone());

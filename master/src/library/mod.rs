@@ -262,9 +262,17 @@ fn short_name(digest: Digest32) -> String {
     format!("sha256:{digits}")
 }
 
+/// Returns the bytes of a volume's codes, as uploads send and store them.
 fn sample_bytes(info: &VolumeInfo) -> u64 {
     let voxels: u64 = info.lattice.dims.iter().map(|&n| u64::from(n)).product();
-    voxels * info.summary.kind.bytes() as u64
+    voxels * info.summary.code_kind().bytes() as u64
+}
+
+/// Returns the bytes that a volume takes in memory: colours have values beside their codes.
+fn memory_bytes(info: &VolumeInfo) -> u64 {
+    let voxels: u64 = info.lattice.dims.iter().map(|&n| u64::from(n)).product();
+    let values = if info.summary.palette.is_some() { info.summary.kind.bytes() } else { 0 };
+    sample_bytes(info) + voxels * values as u64
 }
 
 impl Library {
@@ -330,7 +338,7 @@ impl Library {
         let listed = entries.by_name.iter().filter_map(|(name, entry)| {
             let read = entry.served.as_ref().map(|served| {
                 let info = &served.info;
-                (info.digest, info.lattice.dims, info.summary.kind)
+                (info.digest, info.lattice.dims, info.summary.code_kind())
             });
             let sampled = entry.served.as_ref().map(|served| sample_bytes(&served.info));
             Some(VolumeEntry {
@@ -542,13 +550,14 @@ impl Library {
             }
             entries.uploaded_bytes()
         };
-        if total > self.memory_bytes {
+        let in_memory = memory_bytes(&header.info);
+        if in_memory > self.memory_bytes {
             return Err(VolumeError::NoRoom(
                 format!(
                     "{}: its samples take {} MiB, and the master has {} MiB for volumes \
                      (--volume-memory)",
                     header.name,
-                    total.div_ceil(1 << 20),
+                    in_memory.div_ceil(1 << 20),
                     self.memory_bytes >> 20
                 ),
                 false,

@@ -25,8 +25,8 @@ use std::sync::Arc;
 /// First bytes of the file.
 const MAGIC: [u8; 16] = *b"slabcast volume\n";
 
-/// Bytes of the longest header: histograms have at most 5 KiB.
-const MAX_HEADER: u32 = 64 << 10;
+/// Bytes of the longest header: histograms have at most 5 KiB, a palette 256.
+const MAX_HEADER: u32 = 512 << 10;
 
 /// Bytes that are read at a time.
 const PIECE: usize = 1 << 20;
@@ -79,7 +79,7 @@ pub(super) fn read(path: &Path, most_bytes: u64) -> Result<Source, Unreadable> {
     let unreadable = |reason: String, is_too_large| Unreadable { reason, is_too_large };
     let stored = find(path).map_err(|e| unreadable(format!("its file: {e}"), false))?;
     let header = stored.header;
-    let bytes = super::sample_bytes(&header.info);
+    let bytes = super::memory_bytes(&header.info);
     if bytes > most_bytes {
         let reason = format!(
             "{}: its samples take {} MiB, and the master has {} MiB for volumes (--volume-memory)",
@@ -93,7 +93,15 @@ pub(super) fn read(path: &Path, most_bytes: u64) -> Result<Source, Unreadable> {
         .map_err(|e| unreadable(format!("{}: its file: {e}", header.name), false))?;
     let VolumeHeader { name, file_type, info, orientation } = header;
     let (coarse, lattice, summary) = (info.coarse(), info.lattice, info.summary);
-    let volume = Volume::new(name, file_type, summary.anatomical, lattice, samples, summary.map);
+    let anatomical = summary.anatomical;
+    let volume = match (summary.palette, samples) {
+        (Some(palette), Samples::U16(places)) => {
+            let shown = name.clone();
+            Volume::coloured(name, file_type, anatomical, lattice, palette, places)
+                .map_err(|e| unreadable(format!("{shown}: its palette {e}"), false))?
+        }
+        (_, samples) => Volume::new(name, file_type, anatomical, lattice, samples, summary.map),
+    };
     let volume = Volume { coarse, ..volume };
     if volume.digest() != info.digest {
         let reason = format!(
@@ -111,7 +119,7 @@ fn read_samples(path: &Path, header: &VolumeHeader) -> io::Result<Samples> {
     let mut file = BufReader::with_capacity(PIECE, File::open(path)?);
     read_head(&mut file)?;
     let count = header.info.lattice.len();
-    let kind = header.info.summary.kind;
+    let kind = header.info.summary.code_kind();
     let no_memory = |_| io::Error::new(io::ErrorKind::OutOfMemory, "no memory for its samples");
     let mut piece = vec![0; PIECE];
     let mut samples = Samples::empty(kind);

@@ -1,7 +1,7 @@
 //! Volumes by name and digest: what is found, read, dropped and refused.
 
 use super::*;
-use slabcast_common::volume::Volume;
+use slabcast_common::volume::{Samples, Volume};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 /// A volume of 8 x 8 x 8 bytes; `seed` makes it another.
@@ -311,4 +311,43 @@ fn damaged_file_of_an_upload_is_named_and_never_drawn() {
     drop(library);
     let again = World::library(dir.path(), 8, Arc::default());
     assert!(again.list(Viewer::own()).is_empty(), "a file that is cut is not listed");
+}
+
+#[test]
+fn uploaded_colours_stay_colours_and_a_place_beyond_the_palette_is_refused() {
+    use slabcast_common::volume::{ColourValue, Lattice, Palette};
+    let colours = (0..200u8).map(|i| [i, 255 - i, i / 2, i]).collect();
+    let palette = Palette::sorted(colours, true, ColourValue::Alpha).expect("200 colours");
+    let lattice = Lattice::from_spacing([8; 3], [1.0; 3]);
+    let of = |places: Vec<u16>| {
+        let palette = palette.clone().into();
+        Volume::coloured("c", "RGBA uint8", false, lattice, palette, places)
+    };
+    let volume = of((0..512).map(|i| i % 200).collect()).expect("places in it");
+    let world = World::new(&[], 8);
+    let digest = volume.digest();
+    world.library.begin_upload(header("mine", &volume), None).expect("there is room");
+    let bytes = volume.codes().le_bytes(0..512);
+    assert_eq!(bytes.len(), 1024);
+    world.library.add_chunk(digest, 0, &bytes[..700]).expect("in order");
+    let done = world.library.add_chunk(digest, 700, &bytes[700..]).expect("the last");
+    assert_eq!(done, Progress { received_bytes: 1024, done: true });
+    let World { dir, library, .. } = world;
+    drop(library);
+    let again = World::library(dir.path(), 8, Arc::default());
+    let open = again.open(&VolumeChoice::Digest(digest), Viewer::own()).expect("it stayed");
+    let whole = open.source.whole(0).unwrap();
+    assert_eq!(whole.summary, volume.summary);
+    assert_eq!((whole.codes(), &whole.samples), (volume.codes(), &volume.samples));
+
+    // A stranger's digest may be right, and a place beyond the palette.
+    let mut wrong = volume;
+    let mut places: Vec<u16> = vec![3; 512];
+    places[9] = 200;
+    wrong.places = Some(Samples::U16(places));
+    let digest = wrong.digest();
+    again.begin_upload(header("wrong", &wrong), None).expect("there is room");
+    again.add_chunk(digest, 0, &wrong.codes().le_bytes(0..512)).expect("all of it");
+    let e = again.open(&VolumeChoice::Digest(digest), Viewer::own()).err().expect("it is wrong");
+    assert!(e.to_string().contains("its palette has no colour 200"), "{e}");
 }

@@ -187,11 +187,7 @@ impl Uploads {
             Ok(file)
         });
         let file = created.map_err(|e| no_place(&path, &e))?;
-        let hasher = VolumeHasher::new(
-            &header.info.lattice,
-            header.info.summary.map,
-            header.info.summary.kind,
-        );
+        let hasher = VolumeHasher::of(&header.info.lattice, &header.info.summary);
         let (received, touched) = (0, Instant::now());
         let hasher = Some(hasher);
         let part = Part { header, peer, file, path, hasher, received, total, touched };

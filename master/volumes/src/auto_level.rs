@@ -41,11 +41,13 @@ impl<'a> AutoLevel<'a> {
         levels.iter().rfind(fits).map_or(self.info.level, |level| level.level.max(self.info.level))
     }
 
-    /// Returns the level, at least that of the volume itself.
+    /// Returns the level, at least that of the volume itself. Colours have no other.
     pub fn level(&self) -> u32 {
         let (vox, mut lattice) = (self.info.lattice.vox(), self.info.lattice);
         let mut level = self.info.level;
-        while let Some(coarse) = halved_lattice(&lattice)
+        let has_levels = self.info.summary.palette.is_none();
+        while has_levels
+            && let Some(coarse) = halved_lattice(&lattice)
             && self.pixels * (coarse.vox() / vox) <= AUTO_PIXELS
         {
             (lattice, level) = (coarse, level + 1);

@@ -31,6 +31,8 @@ pub struct Problem {
     pub what: String,
     /// Remedy that is open to the user, in words for people.
     pub remedy: String,
+    /// The numbers of a voxel, 3 or 4, if they are colours: why one of them alone is no volume.
+    pub(crate) colours: Option<u8>,
 }
 
 /// A file that was not opened, and why. `Display` prints one line without control characters.
@@ -54,7 +56,8 @@ impl Problem {
         what: impl Into<String>,
         remedy: impl Into<String>,
     ) -> Self {
-        Problem { kind, field: field.into(), what: what.into(), remedy: remedy.into() }
+        let (field, what, remedy) = (field.into(), what.into(), remedy.into());
+        Problem { kind, field, what, remedy, colours: None }
     }
 
     /// Returns the error with which a caller ends a long piece of work that it was asked to stop.

@@ -46,7 +46,7 @@ fn outline_of(
     let info = &source.levels()[level];
     let inside = |voxel: [u32; 3]| crop.is_none_or(|c| c.contains(&info.lattice, voxel));
     let dims = info.lattice.dims;
-    let codes = match info.summary.kind {
+    let codes = match info.summary.code_kind() {
         SampleKind::U8 => 256,
         SampleKind::U16 => 65536,
         SampleKind::F32 => 0,
@@ -57,7 +57,7 @@ fn outline_of(
         let slices = layer * EDGE as u32..((layer + 1) * EDGE as u32).min(dims[2]);
         let read;
         let (samples, first) = match whole {
-            Some(whole) => (&whole.samples, 0),
+            Some(whole) => (whole.codes(), 0),
             None => {
                 let end = [dims[0], dims[1], slices.end];
                 read = source.read_box(level, [0, 0, slices.start], end)?;

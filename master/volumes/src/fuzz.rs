@@ -562,6 +562,27 @@ fn png_and_jpeg_mutants_neither_panic_nor_hang_nor_fill_memory() {
     );
 }
 
+/// Through the door of files: a volume of colours is read once for each of them.
+#[test]
+fn colour_mutants_neither_panic_nor_hang_nor_fill_memory() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("colours");
+    let seeds: Vec<Vec<u8>> =
+        crate::colours::tests::samples_of_colours().into_iter().map(|(_, _, b)| b).collect();
+    survive(
+        "colours",
+        // A file and four readings of it each.
+        mutants() / 10,
+        |rng| seed_or_mutant(rng, &seeds),
+        |bytes| {
+            std::fs::write(&path, bytes).unwrap();
+            crate::open_with(&path, &Hints::default())
+                .map(|opened| Some(opened.volume))
+                .map_err(|e| e.problem)
+        },
+    );
+}
+
 /// Mutates the headers; the samples beside them stay as they are.
 #[test]
 fn pair_mutants_neither_panic_nor_hang_nor_fill_memory() {

@@ -35,7 +35,7 @@
 //! - volumes by formula: `formula:NAME`
 //!
 //! [`write`](mod@write) writes NRRD and NIfTI-1. [`blocks`] reads and writes volumes larger than memory.
-//! Not read: colours and time series.
+//! Not read: time series.
 //!
 //! Input files are not trusted. A size in a header takes no memory before the bytes were seen;
 //! nothing outside the header's folder is read; every refusal is one line that names the file, the
@@ -46,6 +46,7 @@
 
 pub mod auto_level;
 pub mod blocks;
+mod colours;
 mod data;
 #[cfg(feature = "dicom")]
 pub mod dicom;
@@ -184,7 +185,8 @@ fn open_beside(path: &Path, hints: &Hints) -> Result<Opened, OpenError> {
         Some(_) => {
             hints.check_flags(reads::FORMULA).and_then(|()| formula::open(&shown)).map(Opened::from)
         }
-        None => open_file(path, hints),
+        None => open_file(path, hints)
+            .or_else(|refusal| colours::instead(refusal, path, hints, &open_file)),
     };
     let mut opened = opened.map_err(|problem| OpenError { file: shown.into_owned(), problem })?;
     opened.notes.extend(hints.beside.take_notes());

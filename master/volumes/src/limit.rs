@@ -42,6 +42,18 @@ impl ByteCap {
         self.check_within(need, stored, field, free_memory)
     }
 
+    /// Checks samples of `need` bytes against the limit that the user gave, if there is one: what is
+    /// read in parts is more than each of them.
+    ///
+    /// # Errors
+    /// [`OpenErrorKind::TooLarge`], with the figures and the flag.
+    pub(crate) fn check_asked(&self, need: u64, field: &str) -> Result<(), Problem> {
+        match self.asked {
+            Some(_) => self.check_within(need, u64::MAX, field, free_memory),
+            None => Ok(()),
+        }
+    }
+
     /// Returns the bytes of files that are enough for samples of `need` bytes: more would change
     /// nothing. 0 if any file may become so much.
     #[cfg(feature = "zarr")]

@@ -6,6 +6,7 @@
 //! ITK writes nearly all such files: rows of `TransformMatrix` are the directions of the index
 //! axes, space is LPS (also without a matrix), and `CenterOfRotation` is ignored.
 
+use crate::colours;
 use crate::data::{self, HeaderLines, Skip, Storage};
 use crate::error::{Problem, quoted};
 use crate::pick::{Axis, Kind, Part, Pick};
@@ -218,8 +219,8 @@ fn layout(
     }
     let (dims, more) = sizes.split_first_chunk::<3>().expect("there are three axes or more");
     let layout = Layout::new(*dims, number, endian, "DimSize")?;
-    let numbers = Axis::new(Kind::Channel, "numbers", channels);
-    let mut others = vec![Axis { of_voxel: true, ..numbers }];
+    let colours = colours::may_be_colours(channels, number);
+    let mut others = vec![Axis::of_voxel("numbers", channels, colours)];
     let along = |(i, &n): (usize, &u64)| match more.len() {
         1 => Axis::new(Kind::Other, "volumes", n),
         _ => Axis::new(Kind::Other, format!("along axis {}", i + 4), n),

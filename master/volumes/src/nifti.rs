@@ -7,6 +7,7 @@
 
 pub(crate) mod pair;
 
+use crate::colours;
 use crate::data;
 use crate::error::{OpenErrorKind, Problem};
 use crate::members::{Members, Packing};
@@ -259,8 +260,7 @@ impl Header {
         };
         let mut more = Vec::new();
         if let Some((name, size)) = colours {
-            let axis = Axis::new(Kind::Channel, format!("colours ({name})"), size);
-            more.push(Axis { of_voxel: true, ..axis });
+            more.push(Axis::of_voxel(format!("colours ({name})"), size, true));
         }
         for a in 4..=axes {
             let Ok(size @ 1..) = u64::try_from(self.dim[a]) else {
@@ -273,7 +273,7 @@ impl Header {
             more.push(match a {
                 4 => Axis::new(Kind::Time, "times", size),
                 // The standard's place for the components of vectors.
-                5 => Axis { of_voxel: true, ..Axis::new(Kind::Channel, "components", size) },
+                5 => Axis::of_voxel("components", size, colours::may_be_colours(size, number)),
                 _ => Axis::new(Kind::Other, format!("along dim[{a}]"), size),
             });
         }

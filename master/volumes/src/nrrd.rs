@@ -7,6 +7,7 @@
 //!
 //! All encodings but `zrl` are read (`unpack`).
 
+use crate::colours;
 use crate::data::{self, HeaderLines, Skip, Storage};
 use crate::error::{Problem, quoted};
 use crate::pick::{Axis, Kind, Part, Pick};
@@ -191,7 +192,7 @@ impl Header {
         let number = number_type(fields)?;
         let encoding = encoding(fields)?;
         let endian = endian(fields, number, encoding)?;
-        let axes = Axes::from_fields(fields, pick)?;
+        let axes = Axes::from_fields(fields, number, pick)?;
         let layout = Layout::new(axes.sizes, number, endian, &fields.with_line("sizes"))?;
         let (lattice, anatomical) = lattice(fields, &axes, layout.dims)?;
         let skip = |name: &str| match fields.get(name) {
@@ -360,7 +361,7 @@ struct Axes {
 }
 
 impl Axes {
-    fn from_fields(fields: &Fields, pick: Pick) -> Result<Axes, Problem> {
+    fn from_fields(fields: &Fields, number: Number, pick: Pick) -> Result<Axes, Problem> {
         let dimension = fields.required("dimension", "3")?;
         let count = match dimension.parse::<usize>() {
             Ok(n @ 1..=AXES_MAX) => n,
@@ -450,7 +451,10 @@ impl Axes {
                         }
                         _ => "numbers".into(),
                     };
-                    Axis { of_voxel: true, ..Axis::new(Kind::Channel, name, size) }
+                    // Slicer calls colours `vector`.
+                    let colours = colours::may_be_colours(size, number)
+                        && !matches!(kind, "hsv-color" | "xyz-color");
+                    Axis::of_voxel(name, size, colours)
                 }
             }
         };

@@ -18,11 +18,15 @@ pub struct FileNumbers {
     pub(crate) stored: ValueMap,
     /// Map from numbers to values, which the file gives as slope and intercept.
     pub(crate) rescale: ValueMap,
+    /// Numbers of a voxel, beside each other: 1, or 3 or 4 of colours.
+    pub(crate) channels: usize,
 }
 
 /// Numbers of one type, in pieces.
 #[derive(Clone, Debug)]
 pub(crate) enum Pieces {
+    U8(Vec<Vec<u8>>),
+    U16(Vec<Vec<u16>>),
     U32(Vec<Vec<u32>>),
     I32(Vec<Vec<i32>>),
     U64(Vec<Vec<u64>>),
@@ -54,6 +58,8 @@ wide!(u32: U32, i32: I32, u64: U64, i64: I64, f32: F32, f64: F64);
 impl FileNumbers {
     pub(crate) fn number(&self) -> Number {
         match self.pieces {
+            Pieces::U8(_) => Number::U8,
+            Pieces::U16(_) => Number::U16,
             Pieces::U32(_) => Number::U32,
             Pieces::I32(_) => Number::I32,
             Pieces::U64(_) => Number::U64,
@@ -94,6 +100,8 @@ impl FileNumbers {
             };
         }
         match &self.pieces {
+            Pieces::U8(p) => each!(p),
+            Pieces::U16(p) => each!(p),
             Pieces::U32(p) => each!(p),
             Pieces::I32(p) => each!(p),
             Pieces::U64(p) => each!(p),
@@ -149,7 +157,14 @@ impl Beside {
     /// Leaves the numbers; `stored` maps codes to them.
     pub(crate) fn leave<T: Wide>(&self, pieces: Vec<Vec<T>>, stored: ValueMap) {
         let rescale = ValueMap::IDENTITY;
-        self.left().numbers = Some(FileNumbers { pieces: T::pieces(pieces), stored, rescale });
+        let (pieces, channels) = (T::pieces(pieces), 1);
+        self.left().numbers = Some(FileNumbers { pieces, stored, rescale, channels });
+    }
+
+    /// Leaves the numbers of colours, `channels` of each voxel.
+    pub(crate) fn leave_colours(&self, pieces: Pieces, channels: usize) {
+        let (stored, rescale) = (ValueMap::IDENTITY, ValueMap::IDENTITY);
+        self.left().numbers = Some(FileNumbers { pieces, stored, rescale, channels });
     }
 
     /// Says that the value of a number x is `rescale.value(x)`.

@@ -37,15 +37,38 @@ pub(crate) struct Axis {
     /// Whether the axis holds the components of each voxel (colours, vectors): its first entry alone is no
     /// volume.
     pub(crate) of_voxel: bool,
+    /// Whether these components are red, green, blue and perhaps alpha.
+    pub(crate) colours: bool,
 }
 
 impl Axis {
     pub(crate) fn new(kind: Kind, name: impl Into<String>, size: u64) -> Axis {
-        Axis { kind, name: name.into(), size, of_voxel: false }
+        Axis { kind, name: name.into(), size, of_voxel: false, colours: false }
+    }
+
+    /// Returns the axis of a voxel's numbers, which may be colours.
+    pub(crate) fn of_voxel(name: impl Into<String>, size: u64, colours: bool) -> Axis {
+        Axis { of_voxel: true, colours, ..Axis::new(Kind::Channel, name, size) }
     }
 }
 
 impl Pick {
+    /// Returns which of the `channels` numbers of a pixel is read: the only one, or the one that
+    /// `--channel` says. Three and four are colours.
+    ///
+    /// # Errors
+    /// As [`Pick::choose`].
+    pub(crate) fn of_pixel(&self, channels: u64, field: &str) -> Result<u64, Problem> {
+        let name = if channels == 4 { "colours (RGBA)" } else { "colours (RGB)" };
+        let only_channel = Pick { channel: self.channel, ..Pick::default() };
+        Ok(only_channel.choose(&[Axis::of_voxel(name, channels, true)], field)?.0[0])
+    }
+
+    /// Returns what is asked beside the channel.
+    pub(crate) fn without_channel(&self) -> Pick {
+        Pick { channel: None, ..*self }
+    }
+
     /// Returns an index along each of `axes`, the fastest first, and notes on those that nobody
     /// asked for. `field` is the file's name for the axes.
     ///
@@ -109,11 +132,16 @@ impl Pick {
                 Kind::Other => "--volume",
             };
             if axis.of_voxel {
-                return Err(Problem::unsupported(
+                let problem = Problem::unsupported(
                     field,
                     format!("a voxel is {size} {name}, not one number"),
                     format!("take one of them with {flag} 0 to {}", size - 1),
-                ));
+                );
+                // `--channel` is about the first axis of channels.
+                let first = axes.iter().find(|a| a.kind == Kind::Channel && a.size > 1);
+                let colours = axis.colours && first == Some(axis);
+                let colours = colours.then(|| u8::try_from(*size).ok()).flatten();
+                return Err(Problem { colours, ..problem });
             }
             notes.push(format!("the first of {size} {name} was read; {flag} takes another"));
         }

@@ -140,7 +140,8 @@ pub(crate) fn volume(
         infinite: 0,
         anatomical,
         core: None,
+        palette: None,
     };
     let (name, file_type) = (name.into(), file_type.into());
-    Volume { name, file_type, anatomical, lattice, samples, summary, coarse: None }
+    Volume { name, file_type, anatomical, lattice, samples, summary, coarse: None, places: None }
 }

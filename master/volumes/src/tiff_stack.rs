@@ -11,9 +11,10 @@ mod as_stored;
 mod by_number;
 mod description;
 
+use crate::colours::may_be_colours;
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::limit::ByteCap;
-use crate::pick::{Axis, Kind, Pick};
+use crate::pick::{Axis, Pick};
 use crate::plain::f32_of_half;
 use crate::raw::RawHints;
 use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
@@ -40,6 +41,10 @@ const BAND_MAX_BYTES: u64 = 48 << 20;
 const BAND_FREE_BYTES: u64 = 8 << 20;
 /// Most pages of a file with several channels or times: 16 of each slice.
 const PAGES_MAX: u64 = 16 * DIM_MAX;
+
+/// Names of the numbers of a pixel that are colours to draw.
+const RGB: &str = "colours (RGB)";
+const RGBA: &str = "colours (RGBA)";
 
 /// Returns whether the first bytes are TIFF or BigTIFF.
 pub(crate) fn sniff(head: &[u8]) -> bool {
@@ -393,8 +398,8 @@ impl TiffFile {
         let (bits, channels, what) = match self.decoder.colortype().map_err(|e| tiff_problem(&e))? {
             ColorType::Gray(bits) => (bits, 1, ""),
             ColorType::GrayA(bits) => (bits, 2, "numbers (grey and opacity)"),
-            ColorType::RGB(bits) => (bits, 3, "colours (RGB)"),
-            ColorType::RGBA(bits) => (bits, 4, "colours (RGBA)"),
+            ColorType::RGB(bits) => (bits, 3, RGB),
+            ColorType::RGBA(bits) => (bits, 4, RGBA),
             ColorType::CMYK(bits) => (bits, 4, "colours (CMYK)"),
             ColorType::Multiband { bit_depth, num_samples } => {
                 (bit_depth, u32::from(num_samples).max(1), "channels")
@@ -409,14 +414,6 @@ impl TiffFile {
         };
         let planar = self.decoder.find_tag_unsigned::<u16>(Tag::PlanarConfiguration);
         let planar = channels > 1 && planar.ok().flatten() == Some(2);
-        let mut channel = 0;
-        if channels > 1 {
-            let axis = Axis::new(Kind::Channel, what, channels.into());
-            let pick = Pick { channel: self.pick.channel, ..Pick::default() };
-            let (at, _) =
-                pick.choose(&[Axis { of_voxel: true, ..axis }], "PhotometricInterpretation")?;
-            channel = at[0] as u32;
-        }
         let format = self.decoder.find_tag_unsigned_vec::<u16>(Tag::SampleFormat);
         let format = format.ok().flatten().and_then(|f| f.first().copied()).unwrap_or(1);
         let number = match (bits, format) {
@@ -439,6 +436,13 @@ impl TiffFile {
                 ));
             }
         };
+        let mut channel = 0;
+        if channels > 1 {
+            let colours = matches!(what, RGB | RGBA) && may_be_colours(channels.into(), number);
+            let axis = Axis::of_voxel(what, channels.into(), colours);
+            let pick = Pick { channel: self.pick.channel, ..Pick::default() };
+            channel = pick.choose(&[axis], "PhotometricInterpretation")?.0[0] as u32;
+        }
         // Checked here, so that the first pass refuses what the second could not read.
         Layout::new([width.into(), height.into(), 1], number, Endian::Little, "ImageWidth")?;
         let (chunk_width, chunk_height) = self.decoder.chunk_dimensions();

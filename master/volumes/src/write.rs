@@ -2,7 +2,8 @@
 //!
 //! Samples are written in a type that holds their values exactly, the lattice in RAS+: the file's own
 //! numbers where the volume's codes round them ([`FileNumbers`]). NIfTI has a slope and an intercept;
-//! NRRD has none, so values that are no whole numbers become floats there.
+//! NRRD has none, so values that are no whole numbers become floats there. Voxels with colours of their
+//! own are written as colours.
 
 use crate::numbers::FileNumbers;
 use crate::samples::Number;
@@ -111,6 +112,13 @@ pub fn loss_warning(volume: &Volume, format: Format) -> Option<String> {
 pub fn type_note(volume: &Volume, numbers: Option<&FileNumbers>, format: Format) -> Option<String> {
     let form = NumberForm::choose(volume, numbers, format);
     let (from, to) = (&volume.file_type, form.number.name());
+    if volume.summary.palette.is_some() {
+        let own = numbers.filter(|_| form.own.is_some());
+        let wide = numbers.is_some_and(|n| n.number() != Number::U8);
+        return (wide && own.is_none()).then(|| {
+            "NIfTI has colours of 8 bits, so those are written that are drawn; NRRD keeps 16".into()
+        });
+    }
     if from == to || Number::named(from).is_none() {
         return None;
     }
@@ -149,6 +157,16 @@ impl NumberForm {
         // NIfTI keeps slope and intercept in f32.
         let exact = |x: f64| f64::from(x as f32) == x && x.is_finite();
         let nifti = matches!(format, Format::Nifti { .. });
+        if s.palette.is_some() {
+            // NIfTI has no colours of 16 bits.
+            let own = numbers.filter(|n| !nifti || n.number() == Number::U8);
+            return NumberForm {
+                number: own.map_or(Number::U8, FileNumbers::number),
+                own: own.map(|_| Own::Numbers),
+                number_from_code: ValueMap::IDENTITY,
+                value_from_number: ValueMap::IDENTITY,
+            };
+        }
         if let Some(numbers) = numbers.filter(|n| n.belong_to(s.map)) {
             let map = numbers.rescale;
             let as_they_are = map == ValueMap::IDENTITY
@@ -223,8 +241,8 @@ fn write_samples(
 ) -> io::Result<()> {
     if let (Some(numbers), Some(own)) = (numbers, form.own) {
         let as_values = own == Own::Values;
-        let (size, mut written) = (form.number.bytes(), 0);
-        return numbers.for_each(STEP_SAMPLES, as_values, |bytes| {
+        let (size, mut written) = (form.number.bytes() * numbers.channels as u64, 0);
+        return numbers.for_each(STEP_SAMPLES * numbers.channels, as_values, |bytes| {
             out.write_all(bytes)?;
             written += bytes.len() as u64 / size;
             on_progress(written)
@@ -235,7 +253,15 @@ fn write_samples(
     for first in (0..n).step_by(STEP_SAMPLES) {
         bytes.clear();
         let end = (first + STEP_SAMPLES).min(n);
-        (first..end).for_each(|i| form.put(volume.samples.code(i), &mut bytes));
+        match (&volume.summary.palette, volume.codes()) {
+            (Some(palette), Samples::U16(places)) => {
+                for &place in &places[first..end] {
+                    let colour = palette.colours()[usize::from(place)];
+                    bytes.extend_from_slice(&colour[..palette.channels()]);
+                }
+            }
+            _ => (first..end).for_each(|i| form.put(volume.samples.code(i), &mut bytes)),
+        }
         out.write_all(&bytes)?;
         on_progress(end as u64)?;
     }
@@ -249,9 +275,16 @@ fn nrrd_header(volume: &Volume, number: Number, gzip: bool) -> String {
         true => "space: right-anterior-superior",
         false => "space dimension: 3",
     };
+    // The numbers of colours are an axis before those of space.
+    let [axes, size, none, kind] = match &volume.summary.palette {
+        None => ["3", "", "", ""],
+        Some(palette) if palette.has_alpha() => ["4", "4 ", "none ", "RGBA-color "],
+        Some(_) => ["4", "3 ", "none ", "RGB-color "],
+    };
     format!(
-        "NRRD0004\n# written by slabcast {}\ntype: {}\ndimension: 3\n{space}\nsizes: {} {} {}\n\
-         space directions: {} {} {}\nkinds: domain domain domain\nendian: little\nencoding: {}\n\
+        "NRRD0004\n# written by slabcast {}\ntype: {}\ndimension: {axes}\n{space}\n\
+         sizes: {size}{} {} {}\nspace directions: {none}{} {} {}\n\
+         kinds: {kind}domain domain domain\nendian: little\nencoding: {}\n\
          space origin: {}\n\n",
         env!("CARGO_PKG_VERSION"),
         match number {
@@ -277,7 +310,10 @@ fn nifti_header(volume: &Volume, form: &NumberForm) -> Vec<u8> {
     let mut b = vec![0u8; 352];
     let mut put =
         |offset: usize, bytes: &[u8]| b[offset..offset + bytes.len()].copy_from_slice(bytes);
+    let channels = volume.summary.palette.as_ref().map_or(1, |palette| palette.channels() as i16);
     let code: i16 = match form.number {
+        Number::U8 if channels == 3 => 128,
+        Number::U8 if channels == 4 => 2304,
         Number::U8 => 2,
         Number::I16 => 4,
         Number::I32 => 8,
@@ -291,7 +327,7 @@ fn nifti_header(volume: &Volume, form: &NumberForm) -> Vec<u8> {
     };
     put(0, &348i32.to_le_bytes());
     put(70, &code.to_le_bytes());
-    put(72, &(8 * form.number.bytes() as i16).to_le_bytes());
+    put(72, &(8 * channels * form.number.bytes() as i16).to_le_bytes());
     put(40, &3i16.to_le_bytes());
     put(76, &1f32.to_le_bytes());
     let spacing = l.spacing();

@@ -124,6 +124,7 @@ pub(super) fn summary_from_fields(
         infinite: fields.infinite_samples,
         anatomical: false,
         core: None,
+        palette: None,
     };
     check_summary(&summary)?;
     Ok(summary)

@@ -11,7 +11,8 @@ use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::quality::{Classify, Compositing, Kernel, Quality, Splat, Sums};
 use slabcast_common::shade::{Light, Shading};
 use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
-use slabcast_common::volume::SampleKind;
+use slabcast_common::volume::{ColourValue, Palette, SampleKind, ValueMap, ValueSummary};
+use std::sync::Arc;
 
 enum_conversions!(kernel_to_wire, kernel_from_wire, Kernel, wire::Kernel, None,
     { Gaussian <=> Gaussian, Bspline <=> Bspline, Tent <=> Tent,
@@ -83,6 +84,31 @@ pub(super) fn quality_from_wire(
     };
     quality.check()?;
     Ok(quality)
+}
+
+pub(super) fn palette_to_wire(palette: &Palette) -> wire::Palette {
+    wire::Palette {
+        colours: palette.to_bytes().into(),
+        has_alpha: palette.has_alpha(),
+        value_is_alpha: palette.value() == ColourValue::Alpha,
+    }
+}
+
+/// Adds the palette, if there is one, to the values of a volume.
+pub(super) fn with_palette(
+    summary: ValueSummary,
+    palette: Option<wire::Palette>,
+) -> Result<ValueSummary, WireError> {
+    let Some(palette) = palette else { return Ok(summary) };
+    let wire::Palette { colours, has_alpha, value_is_alpha } = palette;
+    if summary.kind != SampleKind::U8 || summary.map != ValueMap::IDENTITY {
+        let problem = "is there, but the values of colours are 8-bit codes without map";
+        return Err(WireError::value("palette", problem));
+    }
+    let value = if value_is_alpha { ColourValue::Alpha } else { ColourValue::Luminance };
+    let palette = Palette::from_bytes(&colours, has_alpha, value)
+        .map_err(|e| WireError::value("palette.colours", e.to_string()))?;
+    Ok(ValueSummary { palette: Some(Arc::new(palette)), ..summary })
 }
 
 pub(super) fn vec3_to_wire([x, y, z]: [f64; 3]) -> wire::Vec3 {

@@ -12,7 +12,10 @@ use slabcast_common::quality::{Classify, Compositing, Kernel, Quality, Sums};
 use slabcast_common::shade::{Light, Shading};
 use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Projection, View};
-use slabcast_common::volume::{Digest32, Lattice, SampleKind, ValueMap, ValueSummary, VolumeInfo};
+use slabcast_common::volume::{
+    ColourValue, Digest32, Lattice, Palette, SampleKind, ValueMap, ValueSummary, VolumeInfo,
+};
+use std::sync::Arc;
 
 /// Finite numbers of every size, both zeros included.
 pub fn number() -> impl Strategy<Value = f64> {
@@ -112,11 +115,39 @@ pub fn info() -> impl Strategy<Value = VolumeInfo> {
             infinite: odd / 2,
             anatomical: false,
             core: None,
+            palette: None,
         });
-    (any::<[u8; 32]>(), lattice, summary, 0u32..4).prop_map(|(digest, lattice, summary, level)| {
-        let finest_vox = lattice.vox() / f64::from(1 << level);
-        VolumeInfo { digest: Digest32(digest), lattice, summary, level, finest_vox }
-    })
+    (any::<[u8; 32]>(), lattice, summary, 0u32..4, palette()).prop_map(
+        |(digest, lattice, summary, level, palette)| {
+            let summary = match palette {
+                Some(_) => ValueSummary {
+                    kind: SampleKind::U8,
+                    map: ValueMap::IDENTITY,
+                    palette,
+                    ..summary
+                },
+                None => summary,
+            };
+            // Colours have one level.
+            let level = if summary.palette.is_some() { 0 } else { level };
+            let finest_vox = lattice.vox() / f64::from(1 << level);
+            VolumeInfo { digest: Digest32(digest), lattice, summary, level, finest_vox }
+        },
+    )
+}
+
+/// Colours of voxels, of every fourth volume.
+fn palette() -> impl Strategy<Value = Option<Arc<Palette>>> {
+    let colours = vec(any::<[u8; 4]>(), 1..300);
+    let some = (colours, any::<[bool; 2]>()).prop_map(|(mut colours, [alpha, by_alpha])| {
+        if !alpha {
+            colours.iter_mut().for_each(|c| c[3] = 255);
+        }
+        let by_alpha = alpha && by_alpha;
+        let value = if by_alpha { ColourValue::Alpha } else { ColourValue::Luminance };
+        Some(Arc::new(Palette::sorted(colours, alpha, value).expect("at most 300 colours")))
+    });
+    prop_oneof![3 => Just(None), 1 => some]
 }
 
 pub fn transfer() -> impl Strategy<Value = TransferFunction> {
@@ -202,13 +233,12 @@ fn crop() -> impl Strategy<Value = Option<CropBox>> {
 pub fn scene() -> impl Strategy<Value = SceneSpec> {
     let sums = prop_oneof![Just(Sums::I32), Just(Sums::F32)];
     (any::<u64>(), info(), transfer(), quality(sums), crop(), key()).prop_map(
-        |(id, volume, transfer, quality, crop, bricks)| SceneSpec {
-            id: SceneId(id),
-            volume,
-            transfer,
-            quality,
-            crop,
-            bricks,
+        |(id, volume, transfer, quality, crop, bricks)| {
+            let quality = match volume.summary.palette {
+                Some(_) => Quality { sums: quality.sums, ..Quality::before() },
+                None => quality,
+            };
+            SceneSpec { id: SceneId(id), volume, transfer, quality, crop, bricks }
         },
     )
 }

@@ -48,12 +48,13 @@ impl Scene {
     pub fn new(spec: &SceneSpec) -> Self {
         let classifier = Classifier::new(&spec.transfer, &spec.volume, spec.quality.compositing);
         let payload_max = classifier.payload_max();
-        let after = spec.quality.classify == Classify::After;
+        let quality = spec.quality.for_volume(&spec.volume.summary);
+        let after = quality.classify == Classify::After;
         Scene {
             field: after.then(|| FieldScene::new(spec, &classifier)),
             classifier,
             shading: spec.transfer.shading,
-            quality: spec.quality,
+            quality,
             grid: BrickGrid::new(spec.volume.lattice.dims),
             dims: spec.volume.lattice.dims,
             payload_max,

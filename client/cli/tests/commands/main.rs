@@ -5,6 +5,7 @@
 
 mod after;
 mod colour_rule;
+mod colour_volumes;
 mod colours_and_cameras;
 mod config;
 mod convergence;

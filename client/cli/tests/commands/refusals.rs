@@ -110,7 +110,7 @@ fn files_of_other_formats(put: &dyn Fn(&str, &[u8])) {
     put(
         "channels.mha",
         &meta(
-            "ElementNumberOfChannels = 3\nElementType = MET_UCHAR\nElementDataFile = LOCAL\n",
+            "ElementNumberOfChannels = 3\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n",
             b"",
         ),
     );

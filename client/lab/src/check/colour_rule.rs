@@ -91,7 +91,7 @@ struct Line {
 
 /// Runs the command.
 pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
-    let request = args.of.request_before(Work::default())?;
+    let mut request = args.of.request_before(Work::default())?;
     let given = Quality::before();
     for (flag, given) in [
         ("thickness", request.quality.thickness != given.thickness),
@@ -102,7 +102,7 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
         }
     }
     let threads = args.threads.count();
-    let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
+    let OpenedVolume { volume, info, orientation } = args.of.open(&mut request)?;
     let transfer = request.transfer.function(&info).map_err(|e| request.blame(&e))?;
     let camera =
         request.path.camera(0, &info.lattice, orientation).map_err(|e| request.blame(&e))?;

@@ -135,7 +135,7 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
         Schedule::Auto => vec![Schedule::Region, Schedule::Slab],
         one => vec![one],
     };
-    let request = args.of.request(work)?;
+    let mut request = args.of.request(work)?;
     let workers = &args.workers.0;
     let most = workers.iter().copied().max().unwrap_or(1);
     if u64::from(most) * u64::from(args.threads) > 65536 {
@@ -164,7 +164,7 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
     if let Some(file) = args.trace.as_deref().filter(|file| !file.exists()) {
         probe(file)?;
     }
-    let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
+    let OpenedVolume { volume, info, orientation } = args.of.open(&mut request)?;
     progress.phase("cutting the volume into bricks");
     let names = (volume.name.clone(), request.transfer.name().to_string());
     let scenes = PathScenes::new(&volume, &info, &request, orientation)?;

@@ -217,11 +217,11 @@ pub fn run(args: &ReportArgs) -> Result<(), Fail> {
 }
 
 fn measure(args: &ReportArgs) -> Result<Report, Fail> {
-    let request = args.of.request(Work::default())?;
+    let mut request = args.of.request(Work::default())?;
     let threads = args.threads.count();
     let mut progress = Progress::new(false).counting("setting");
     progress.phase(&format!("reading {}", args.of.volume.display()));
-    let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
+    let OpenedVolume { volume, info, orientation } = args.of.open(&mut request)?;
     let (name, digest) = (volume.name.clone(), info.digest.to_string());
     let mut trial = Trial::new(volume, info, &request, orientation, threads)?;
     let points = sweep::points(&trial, &args.only);

@@ -63,7 +63,7 @@ impl Bench<'_> {
         }
         let mut progress = Progress::new(false).counting("view");
         progress.phase(&format!("reading {}", args.of.volume.display()));
-        let opened = args.of.open(&request)?;
+        let opened = args.of.open(&mut request)?;
         progress.phase("measuring what messages take");
         let pings = pinged();
         let cores = machine::cores();

@@ -245,6 +245,11 @@ fn edges(camera: &Camera) -> [(Place, String); 4] {
 
 impl Colours {
     fn new(request: &RenderRequest, info: &VolumeInfo) -> Result<Colours, Fail> {
+        if info.summary.palette.is_some() {
+            return Err(Fail::usage(
+                "--color-bar: the voxels have colours of their own, which no bar shows; leave it out",
+            ));
+        }
         let tf = request.transfer.function(info).map_err(|e| request.blame(&e))?;
         let (from, to) = crate::transfer::shown_values(&tf, info);
         let classifier = Classifier::new(&tf, info, Compositing::Linear);

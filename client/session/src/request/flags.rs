@@ -423,6 +423,7 @@ impl SceneArgs {
             path_file: view.path.clone(),
             side: view.view.is_some().then(|| view.axes.clone()),
             quality,
+            asks_after: flags.classify == Some(Classify::After),
             target: flags.target,
             work,
             background: picture.background,
@@ -474,11 +475,11 @@ impl VolumeSceneArgs {
         Ok(RenderRequest { level: self.input.level(), ..self.scene.request_with_target(work)? })
     }
 
-    /// Opens the volume and checks that the request can be drawn of it.
+    /// Opens the volume and makes the request fit it ([`RenderRequest::fit`]).
     ///
     /// # Errors
     /// The file can't be read, or the request doesn't fit the volume.
-    pub fn open(&self, request: &RenderRequest) -> Result<OpenedVolume, Fail> {
+    pub fn open(&self, request: &mut RenderRequest) -> Result<OpenedVolume, Fail> {
         let volume = self.input.open(&self.volume)?;
         let orientation = self.scene.view.axes.for_volume(&volume)?;
         let info = volume.info(volume.digest());

@@ -42,6 +42,8 @@ pub struct RenderRequest {
     pub quality: Quality,
     /// Level of detail of the pictures.
     pub level: LevelChoice,
+    /// Whether a flag asks for classification after reconstruction, and not the default.
+    asks_after: bool,
     /// Error or time that the quality is to be chosen by; empty if the user gave none.
     pub target: QualityTarget,
     /// Factor by which the width and height of drawn pictures are enlarged; 1 = not at all.
@@ -92,6 +94,7 @@ impl RenderRequest {
             transfer,
             quality: Quality::default(),
             level: LevelChoice::default(),
+            asks_after: false,
             target: QualityTarget::default(),
             magnify: 1,
             work: Work::default(),
@@ -102,16 +105,27 @@ impl RenderRequest {
     }
 
     /// Checks that all of it can be drawn of this volume; `anatomical` says whether the volume's
-    /// file has anatomical axes.
+    /// file has anatomical axes. Voxels with colours of their own take the order of classification
+    /// that they need ([`Quality::for_volume`]).
     ///
     /// # Errors
     /// A flag or a field of a file doesn't fit the volume; the error names it.
     pub fn fit(
-        &self,
+        &mut self,
         info: &VolumeInfo,
         orientation: Orientation,
         anatomical: bool,
     ) -> Result<(), Fail> {
+        if info.summary.palette.is_some() {
+            if self.asks_after {
+                return Err(Fail::usage(
+                    "--classify: the voxels have colours of their own, between which nothing can be \
+                     reconstructed; leave it out, or take one of their numbers with --channel",
+                ));
+            }
+            self.quality = self.quality.for_volume(&info.summary);
+            self.quality.check().map_err(|e| self.blame(&e))?;
+        }
         if let Some(axes) = &self.side {
             let usual = Orientation::for_volume(None, None, &info.summary, anatomical)
                 .map_err(|e| Fail::flag(&e))?;

@@ -22,7 +22,7 @@ use slabcast_common::spelling::nearest;
 use slabcast_common::transfer::{
     ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction, interpolate,
 };
-use slabcast_common::volume::{SampleKind, ValueSummary};
+use slabcast_common::volume::{ColourValue, SampleKind, ValueSummary};
 
 /// Names of the presets and what each is for, in the order of the help text. [`MAPS`] has the
 /// colour maps.
@@ -130,7 +130,18 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, I
     };
     // Where what is dense begins, for those volumes that have no Hounsfield units to say so.
     let dense = air + (top - air) * 0.55;
+    // The opacity that the file gives its voxels.
+    let alpha = summary.palette.as_ref().is_some_and(|p| p.value() == ColourValue::Alpha);
     let tf = match name {
+        "auto" if alpha => {
+            let tf = look(&STONE, [0.0, 1.0], &[]);
+            let opacities = vec![[0.0, 0.0], [255.0, 1.0]];
+            return Ok(TransferFunction { domain: Domain::Value, opacities, ..tf });
+        }
+        // Flat colours in black have no air by the histogram: each value is a peak.
+        "auto" if summary.palette.is_some() && black_is_air(summary, &l) => {
+            surface(&STONE, [0.0, 1.0], 0.0, FULL_COLOUR / summary.max_code.max(FULL_COLOUR))
+        }
         // Of a CT the skin hides the bones, and the couch the body.
         "auto" if at.is_some() => return by_name("muscle", summary),
         // At the edge of a mask nothing is to be seen but the mask.
@@ -262,6 +273,15 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, I
         }
     };
     Ok(if name.starts_with("peer-") { tf } else { over_whole_range(tf, summary) })
+}
+
+/// Value of a colour from which on it is opaque in black.
+const FULL_COLOUR: f64 = 24.0;
+
+/// Returns whether a twentieth of the colours is black where levels find something everywhere.
+fn black_is_air(summary: &ValueSummary, levels: &Levels) -> bool {
+    let black = if summary.min_code == 0.0 { summary.histogram[0] } else { 0 };
+    levels.content == Content::Everywhere && black.saturating_mul(20) >= summary.total()
 }
 
 /// Returns a function over the range that presets are fitted to as one over the whole volume.
@@ -587,5 +607,26 @@ mod tests {
         let s = ValueSummary::from_samples(&Samples::U8(v), ValueMap::IDENTITY);
         let cut = air_end(&s);
         assert!((11.0..100.0).contains(&cut), "cut at {cut}");
+    }
+
+    #[test]
+    fn auto_of_colours_takes_alpha_as_it_is_and_black_for_air() {
+        use slabcast_common::volume::{Lattice, Palette, Volume};
+        let summary = |colours: Vec<[u8; 4]>, value, places: Vec<u16>| {
+            let alpha = value == ColourValue::Alpha;
+            let palette = Palette::new(colours, alpha, value).unwrap();
+            let lattice = Lattice::from_spacing([places.len() as u32, 1, 1], [1.0; 3]);
+            Volume::coloured("c", "c", false, lattice, palette.into(), places).unwrap().summary
+        };
+        let clear = vec![[0, 0, 0, 0], [9, 9, 9, 100], [1, 2, 3, 255]];
+        let tf = by_name("auto", &summary(clear, ColourValue::Alpha, vec![0, 1, 2])).unwrap();
+        assert_eq!((tf.domain, tf.opacities), (Domain::Value, vec![[0.0, 0.0], [255.0, 1.0]]));
+        // A third is black, and the rest are flat colours.
+        let flat: Vec<[u8; 4]> = (0..9).map(|i| [i * 28, i * 28, i * 28, 255]).collect();
+        let places: Vec<u16> = (0..1200).map(|i| if i % 3 == 0 { 0 } else { i % 9 }).collect();
+        let s = summary(flat, ColourValue::Luminance, places);
+        let tf = by_name("auto", &s).unwrap();
+        let at = |value: f64| interpolate(&tf.opacities, value / s.max_code)[1];
+        assert_eq!((at(0.0), at(28.0), at(224.0)), (0.0, 1.0, 1.0));
     }
 }

@@ -46,11 +46,14 @@ fn halved_axes(lattice: &Lattice) -> [bool; 3] {
     std::array::from_fn(|a| dims[a] > 1 && spacing[a] < 2.0 * smallest)
 }
 
-/// Returns the next coarser level of a volume; `None` if no axis can be halved. It keeps the summary
-/// of level 0.
+/// Returns the next coarser level of a volume; `None` if no axis can be halved, or voxels have colours
+/// of their own: places in a palette have no mean. It keeps the summary of level 0.
 ///
 /// Memory: the coarser samples, beside those of `fine`.
 pub fn coarser(fine: &Volume) -> Option<Volume> {
+    if fine.places.is_some() {
+        return None;
+    }
     let lattice = halved_lattice(&fine.lattice)?;
     let finest_vox = fine.coarse.map_or_else(|| fine.lattice.vox(), |coarse| coarse.finest_vox);
     let level = fine.coarse.map_or(0, |coarse| coarse.level) + 1;
@@ -62,6 +65,7 @@ pub fn coarser(fine: &Volume) -> Option<Volume> {
         samples: halved(&fine.lattice, fine.lattice.dims, &fine.samples),
         summary: fine.summary.clone(),
         coarse: Some(CoarseLevel { level, finest_vox }),
+        places: None,
     })
 }
 

@@ -46,7 +46,7 @@ impl<V: Deref<Target = Volume> + Send + Sync> BlockSource for MemorySource<V> {
 
     fn read_box(&self, level: usize, lo: [u32; 3], hi: [u32; 3]) -> Result<Samples, Problem> {
         assert_eq!(level, 0, "a volume in memory has one level");
-        Ok(copy_box(&self.volume.samples, self.volume.lattice.dims, lo, hi))
+        Ok(copy_box(self.volume.codes(), self.volume.lattice.dims, lo, hi))
     }
 
     fn summaries(&self, level: usize) -> Result<Arc<BlockSummaries>, Problem> {
@@ -55,8 +55,7 @@ impl<V: Deref<Target = Volume> + Send + Sync> BlockSource for MemorySource<V> {
     }
 
     fn memory_bytes(&self) -> u64 {
-        let samples = &self.volume.samples;
-        (samples.len() * samples.kind().bytes()) as u64
+        self.volume.memory_bytes()
     }
 
     fn whole(&self, level: usize) -> Option<&Volume> {
@@ -98,7 +97,7 @@ fn summarise(volume: &Volume) -> BlockSummaries {
         let at = [at[0] as u32, at[1] as u32, (i / dims[0] as usize / dims[1] as usize) as u32];
         let lo = at.map(|n| n * BLOCK_EDGE);
         let hi = std::array::from_fn(|a| (lo[a] + BLOCK_EDGE).min(volume.lattice.dims[a]));
-        BlockSummary::of(&copy_box(&volume.samples, volume.lattice.dims, lo, hi), &bins)
+        BlockSummary::of(&copy_box(volume.codes(), volume.lattice.dims, lo, hi), &bins)
     };
     BlockSummaries { dims, bins, all: (0..count).into_par_iter().map(of).collect() }
 }

@@ -79,6 +79,13 @@ impl Planes {
         }
         let (opened, numbers) =
             crate::open_numbers(path, hints).map_err(|opening| opening.problem)?;
+        if opened.volume.places.is_some() {
+            return Err(Problem::unsupported(
+                "content",
+                "is in colours, which have no coarser levels",
+                "take one of them with --channel, or write NRRD or NIfTI",
+            ));
+        }
         Ok(Planes::in_memory(opened.volume, numbers, opened.notes))
     }
 

@@ -37,6 +37,7 @@ impl Counter {
                     infinite: 0,
                     anatomical: false,
                     core: None,
+                    palette: None,
                 },
             },
             _ => Counter::Codes { kind, counts: vec![0; 1 << (8 * kind.bytes())] },

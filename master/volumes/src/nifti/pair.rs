@@ -54,7 +54,11 @@ pub(crate) fn read(
         // What ANALYZE keeps in their places has another meaning.
         (header.qform_code, header.sform_code, header.inter, header.units) = (0, 0, 0.0, 2);
     }
-    let (layout, part, said) = header.layout(endian, pick)?;
+    let (layout, part, said) = header.layout(endian, pick).map_err(|p| match nifti {
+        true => p,
+        // Programs wrote red, green and blue of ANALYZE beside each other, or slice by slice.
+        false => Problem { colours: None, ..p },
+    })?;
     said.into_iter().for_each(|note| notes.add(note));
     if !nifti && let Some((stem, _)) = stem(name) {
         let mat = format!("{stem}.mat");

@@ -1,6 +1,6 @@
 //! Decoder of a JPEG picture, which is decoded whole.
 
-use super::{Shape, check_whole, picked, push_grey};
+use super::{Channel, Shape, check_whole, push};
 use crate::error::{OpenErrorKind, Problem};
 use crate::samples::Number;
 use crate::source::Source;
@@ -17,13 +17,13 @@ const FILE_MAX_BYTES: u64 = 48 << 20;
 pub(super) struct Jpeg {
     bytes: Vec<u8>,
     pub(super) shape: Shape,
-    /// The number of each pixel that is read, if not the grey.
-    picked: Option<usize>,
+    /// Numbers of a pixel: 1, or 3 of colours.
+    pub(super) channels: u64,
 }
 
 impl Jpeg {
     pub(super) fn open(source: Source) -> Result<Jpeg, Problem> {
-        let (len, pick) = (source.len, source.pick);
+        let len = source.len;
         if len > FILE_MAX_BYTES {
             return Err(Problem::new(
                 OpenErrorKind::TooLarge,
@@ -39,20 +39,24 @@ impl Jpeg {
             .read_to_end(&mut bytes)
             .map_err(|e| Problem::io("picture", &e))?;
         let header = Frame::of_picture(&bytes)?;
-        let picked = picked(&pick, if header.components == 1 { 1 } else { 3 })?;
         let shape =
             Shape { width: header.width.into(), height: header.height.into(), number: Number::U8 };
         // One byte a colour, and coefficients of two bytes if it is progressive.
         let each = u64::from(header.components) * if header.process == 2 { 3 } else { 1 };
         check_whole(each * u64::from(header.width) * u64::from(header.height), len)?;
-        Ok(Jpeg { bytes, shape, picked })
+        let channels = if header.components == 1 { 1 } else { 3 };
+        Ok(Jpeg { bytes, shape, channels })
     }
 
-    /// Writes the samples of all rows.
-    pub(super) fn all(&mut self, out: &mut Vec<u8>) -> Result<(), Problem> {
+    /// Writes the samples of all rows: of one channel, or of all that are grey.
+    pub(super) fn all(
+        &mut self,
+        channel: Option<Channel>,
+        out: &mut Vec<u8>,
+    ) -> Result<(), Problem> {
         let bytes = std::mem::take(&mut self.bytes);
         let (pixels, channels) = decode(&bytes)?;
-        push_grey(&pixels, (channels, self.picked), 1, out)?;
+        push(&pixels, (channels, 1), channel, out)?;
         Ok(())
     }
 }

@@ -1,15 +1,14 @@
 //! Reader of stacks of PNG and JPEG pictures: the files of a folder, in the order of the numbers in
 //! their names, become slices.
 //!
-//! A picture is grey, or has colours of which red, green and blue are equal in every pixel. The
-//! values are those that are stored: a PNG of one bit holds 0 and 1. Pictures have no spacing; it
-//! comes from `--spacing`.
+//! A picture is grey, or has colours of which red, green and blue are equal in every pixel; of others one
+//! channel is read. The values are those that are stored: a PNG of one bit holds 0 and 1. Pictures have
+//! no spacing; it comes from `--spacing`.
 
 pub(crate) mod jpeg;
 mod png;
 
 use crate::error::{OpenErrorKind, Problem, quoted};
-use crate::pick::{Axis, Kind, Pick};
 use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
 use crate::source::{Notes, Source};
 use crate::unpack::{copy_on, wrapped};
@@ -85,10 +84,9 @@ enum Picture {
 
 impl Picture {
     /// Opens a file and reads its header.
-    fn open(path: &Path, pick: Pick, notes: &Notes) -> Result<(Picture, u64), Problem> {
+    fn open(path: &Path, notes: &Notes) -> Result<(Picture, u64), Problem> {
         let mut source = Source::open(path, "file")?;
         source.notes = notes.clone();
-        source.pick = pick;
         let len = source.len;
         let picture = match is_jpeg(source.head()?) {
             true => Picture::Jpeg(jpeg::Jpeg::open(source)?),
@@ -114,48 +112,75 @@ impl Picture {
         }
     }
 
-    /// Writes the samples of the next rows, big-endian.
-    fn rows(&mut self, out: &mut Vec<u8>) -> Result<(), Problem> {
+    /// Returns the numbers of a pixel that are colours and opacity: 1 to 4.
+    fn channels(&self) -> u64 {
         match self {
-            Picture::Png(png) => png.row(out),
-            Picture::Jpeg(jpeg) => jpeg.all(out),
+            Picture::Png(png) => png.channels(),
+            Picture::Jpeg(jpeg) => jpeg.channels,
+        }
+    }
+
+    /// Writes the samples of the next rows, big-endian: of one channel, or of all that are grey.
+    fn rows(&mut self, channel: Option<Channel>, out: &mut Vec<u8>) -> Result<(), Problem> {
+        match self {
+            Picture::Png(png) => png.row(channel, out),
+            Picture::Jpeg(jpeg) => jpeg.all(channel, out),
         }
     }
 }
 
 /// Returns the error for a pixel whose red, green and blue differ.
-fn colours() -> Problem {
-    Problem::unsupported(
+fn colours(channels: usize) -> Problem {
+    let problem = Problem::unsupported(
         "picture",
         "is in colours: red, green and blue differ",
         "take one of them with --channel 0 to 2, or save the stack in shades of grey",
-    )
+    );
+    Problem { colours: Some(if channels == 4 { 4 } else { 3 }), ..problem }
 }
 
-/// Returns the number of each pixel that was asked for; `None` asks for the grey. A pixel has
-/// `channels` numbers.
-fn picked(pick: &Pick, channels: usize) -> Result<Option<usize>, Problem> {
-    let axis = Axis { of_voxel: true, ..Axis::new(Kind::Channel, "colours", channels as u64) };
-    if pick.channel.is_none() {
-        pick.choose(&[], "picture")?;
-        return Ok(None);
+/// Returns the numbers of a pixel that two pictures of a stack have together. One with opacity makes all
+/// have it, and so do colours.
+fn together(a: u64, b: u64) -> u64 {
+    let is_alpha = a.is_multiple_of(2) || b.is_multiple_of(2);
+    if a.max(b) < 3 { a.max(b) } else { 3 + u64::from(is_alpha) }
+}
+
+/// A number of each pixel that is read of a stack.
+#[derive(Clone, Copy)]
+struct Channel {
+    index: u64,
+    /// Numbers of a pixel that the stack's pictures have together: grey, grey and opacity, three
+    /// colours, or those and opacity.
+    of: u64,
+}
+
+impl Channel {
+    /// Returns the index among the `channels` numbers of one picture's pixels; `None` is full opacity.
+    fn within(self, channels: usize) -> Option<usize> {
+        if self.of.is_multiple_of(2) && self.index == self.of - 1 {
+            return channels.is_multiple_of(2).then(|| channels - 1);
+        }
+        Some(if channels < 3 { 0 } else { self.index as usize })
     }
-    let (at, _) = pick.choose(&[axis], "picture")?;
-    Ok(Some(at[0] as usize))
 }
 
-/// Writes one number of each pixel of `channels` numbers of `size` bytes: one, grey and opacity, three
-/// colours, or those and opacity. That is the one with index `picked`, or else the grey. Returns
-/// whether nothing is lost: all are opaque.
-fn push_grey(
+/// Writes one channel of pixels of `channels` numbers of `size` bytes (one, grey and opacity, three
+/// colours, or those and opacity), or their grey. Returns whether all are opaque, or it matters not.
+fn push(
     pixels: &[u8],
-    (channels, picked): (usize, Option<usize>),
-    size: usize,
+    (channels, size): (usize, usize),
+    channel: Option<Channel>,
     out: &mut Vec<u8>,
 ) -> Result<bool, Problem> {
-    if let Some(at) = picked.filter(|at| *at < channels) {
+    if let Some(channel) = channel {
+        let number = channel.within(channels);
         for pixel in pixels.chunks_exact(channels * size) {
-            out.extend_from_slice(&pixel[at * size..(at + 1) * size]);
+            match number {
+                Some(i) => out.extend_from_slice(&pixel[i * size..(i + 1) * size]),
+                // What has no opacity of its own is opaque.
+                None => out.extend(std::iter::repeat_n(0xff, size)),
+            }
         }
         return Ok(true);
     }
@@ -174,7 +199,7 @@ fn push_grey(
         }
         out.extend_from_slice(at(0));
     }
-    if grey { Ok(opaque) } else { Err(colours()) }
+    if grey { Ok(opaque) } else { Err(colours(channels)) }
 }
 
 /// Reads pictures, in the order given, as slices of a volume called `name`, of at most `cap`.
@@ -184,6 +209,7 @@ pub(crate) fn read_files(
     hints: &Hints,
 ) -> Result<Opened, Problem> {
     let cap = hints.cap();
+    hints.pick.without_channel().choose(&[], "folder")?;
     let count = files.len() as u64;
     if count > DIM_MAX {
         return Err(Problem::new(
@@ -194,12 +220,12 @@ pub(crate) fn read_files(
         ));
     }
     let notes = Notes::default();
-    let (mut first, mut total) = (None, 0);
+    let (mut first, mut total, mut channels) = (None, 0, 1);
     for path in &files {
         let shown = quoted(&path.file_name().unwrap_or_default().to_string_lossy());
-        let (picture, len) =
-            Picture::open(path, hints.pick, &notes).map_err(|p| in_file(path, p))?;
+        let (picture, len) = Picture::open(path, &notes).map_err(|p| in_file(path, p))?;
         total += len;
+        channels = together(channels, picture.channels());
         let (shape, palette) = (picture.shape(), picture.palette().map(<[u8]>::to_vec));
         match &first {
             None => first = Some((shape, palette)),
@@ -215,6 +241,9 @@ pub(crate) fn read_files(
         }
     }
     let (shape, _) = first.expect("the caller passes a file");
+    // Without the flag they may all be grey.
+    let of = hints.pick.channel.map(|_| hints.pick.of_pixel(channels, "folder")).transpose()?;
+    let channel = of.map(|index| Channel { index, of: channels }).filter(|_| channels > 1);
     let sizes = [shape.width.into(), shape.height.into(), count];
     let layout = Layout::new(sizes, shape.number, Endian::Big, "pictures")?;
     let lattice = Lattice::from_spacing(layout.dims, hints.raw.spacing.unwrap_or([1.0; 3]));
@@ -226,12 +255,16 @@ pub(crate) fn read_files(
         rows: Vec::new(),
         consumed: 0,
         left: 0,
-        pick: hints.pick,
+        channel,
         notes: notes.clone(),
     };
     // Deflate is denser than JPEG, of which a byte holds some hundred pixels.
     let supply = Supply::deflate("pictures", total);
-    let (samples, map) = samples::read(&mut stack, supply, &layout, cap)?;
+    let (samples, map) = samples::read(&mut stack, supply, &layout, cap).map_err(|p| {
+        // The first picture with colours may have no opacity where others have.
+        let colours = p.colours.map(|_| channels as u8);
+        Problem { colours, ..p }
+    })?;
     if hints.raw.spacing.is_none() {
         notes.add("pictures have no spacing; 1 mm was taken (--spacing sets it)");
     }
@@ -265,7 +298,8 @@ struct Stack {
     consumed: usize,
     /// Bytes of the current picture that are still to be decoded.
     left: u64,
-    pick: Pick,
+    /// The channel that is read; `None` for the grey.
+    channel: Option<Channel>,
     notes: Notes,
 }
 
@@ -274,8 +308,7 @@ impl Stack {
     fn fill(&mut self) -> Result<bool, Problem> {
         if self.left == 0 {
             let Some(path) = self.files.pop_front() else { return Ok(false) };
-            let (picture, _) =
-                Picture::open(&path, self.pick, &self.notes).map_err(|p| in_file(&path, p))?;
+            let (picture, _) = Picture::open(&path, &self.notes).map_err(|p| in_file(&path, p))?;
             // The file may have changed since the first pass.
             if picture.shape() != self.shape {
                 return Err(differs("a picture", picture.shape(), self.shape));
@@ -287,7 +320,7 @@ impl Stack {
         let Some((path, picture)) = &mut self.current else { return Ok(false) };
         self.rows.clear();
         self.consumed = 0;
-        picture.rows(&mut self.rows).map_err(|p| in_file(path, p))?;
+        picture.rows(self.channel, &mut self.rows).map_err(|p| in_file(path, p))?;
         let came = self.rows.len() as u64;
         if came == 0 || came > self.left {
             let problem = Problem::new(
@@ -324,7 +357,7 @@ pub(crate) fn one_picture(mut source: Source) -> Result<Vec<u8>, Problem> {
     let (mut rows, mut have) = (Vec::new(), 0);
     while have < need {
         rows.clear();
-        picture.rows(&mut rows)?;
+        picture.rows(None, &mut rows)?;
         if rows.is_empty() {
             return Err(samples::truncated(need, have));
         }

@@ -1,6 +1,6 @@
 //! Decoder of a PNG picture, row by row; an interlaced one is decoded whole.
 
-use super::{Shape, check_whole, picked, push_grey};
+use super::{Channel, Shape, check_whole, push};
 use crate::error::{OpenErrorKind, Problem};
 use crate::samples::{self, Number};
 use crate::source::{Notes, Source, Stream};
@@ -24,14 +24,12 @@ pub(super) struct Png {
     whole: Option<(Vec<u8>, usize)>,
     /// Bytes of the file.
     len: u64,
-    /// The number of each pixel that is read, if not the grey.
-    picked: Option<usize>,
     notes: Notes,
 }
 
 impl Png {
     pub(super) fn open(source: Source) -> Result<Png, Problem> {
-        let Source { reader, len, notes, pick, .. } = source;
+        let Source { reader, len, notes, .. } = source;
         let limits = Limits { bytes: CHUNKS_MAX_BYTES };
         let mut decoder = Decoder::new_with_limits(reader, limits);
         decoder.set_ignore_text_chunk(true);
@@ -39,7 +37,6 @@ impl Png {
         let reader = decoder.read_info().map_err(|e| problem(&e))?;
         let info = reader.info();
         let (colour, depth) = (info.color_type, info.bit_depth);
-        let picked = picked(&pick, colour.samples())?;
         let number = if depth == BitDepth::Sixteen { Number::U16 } else { Number::U8 };
         let shape = Shape { width: info.width, height: info.height, number };
         let (mut palette, mut greys) = (None, None);
@@ -57,12 +54,21 @@ impl Png {
             notes.add("transparency of pixels was not read");
         }
         let whole = info.interlaced.then(|| (Vec::new(), 0));
-        Ok(Png { reader, shape, palette, greys, colour, depth, whole, len, picked, notes })
+        Ok(Png { reader, shape, palette, greys, colour, depth, whole, len, notes })
     }
 
-    /// Writes the samples of the next row, big-endian.
-    pub(super) fn row(&mut self, out: &mut Vec<u8>) -> Result<(), Problem> {
-        let Png { reader, shape, greys, colour, depth, whole, len, picked, notes, .. } = self;
+    /// Returns the numbers of a pixel that are colours and opacity: 1 to 4.
+    pub(super) fn channels(&self) -> u64 {
+        self.colour.samples() as u64
+    }
+
+    /// Writes the samples of the next row, big-endian: of one channel, or of all that are grey.
+    pub(super) fn row(
+        &mut self,
+        channel: Option<Channel>,
+        out: &mut Vec<u8>,
+    ) -> Result<(), Problem> {
+        let Png { reader, shape, greys, colour, depth, whole, len, notes, .. } = self;
         let row = match whole {
             None => {
                 let row = reader.next_row().map_err(|e| problem(&e))?;
@@ -85,8 +91,8 @@ impl Png {
         let width = shape.width as usize;
         let indices = out.len();
         let opaque = match depth {
-            BitDepth::Sixteen => push_grey(row, (colour.samples(), *picked), 2, out)?,
-            BitDepth::Eight => push_grey(row, (colour.samples(), *picked), 1, out)?,
+            BitDepth::Sixteen => push(row, (colour.samples(), 2), channel, out)?,
+            BitDepth::Eight => push(row, (colour.samples(), 1), channel, out)?,
             // The first pixel is in the highest bits.
             BitDepth::One | BitDepth::Two | BitDepth::Four => {
                 let bits = *depth as usize;

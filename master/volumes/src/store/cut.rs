@@ -42,9 +42,18 @@ pub(super) struct SampleBox<'a> {
     pub(super) hi: [u32; 3],
 }
 
+/// Numbers of the same box beside its samples.
+#[derive(Clone, Copy)]
+struct Beside<'a> {
+    /// Coefficients that bricks hold in place of samples.
+    coefficients: Option<&'a SampleBox<'a>>,
+    /// Values of which gradients are, where samples are places in a palette.
+    values: Option<&'a [u8]>,
+}
+
 impl<'a> Cutter<'a> {
     pub(super) fn new(info: &'a VolumeInfo, needs: &'a BrickNeeds) -> Cutter<'a> {
-        let codes = match info.summary.kind {
+        let codes = match info.summary.code_kind() {
             SampleKind::U8 => 256,
             SampleKind::U16 => 65536,
             SampleKind::F32 => 0,
@@ -76,18 +85,26 @@ impl<'a> Cutter<'a> {
         let SampleBox { lo: from, hi: to, .. } = *samples;
         let (bounds, block) = ((from, to), (lo, hi));
         let visible = &self.visible[..];
+        let mut beside = Beside { coefficients, values: None };
         match samples.samples {
             Samples::U8(v) => {
                 let seen = |c: u8| visible[usize::from(c)];
-                self.cut_codes(v, bounds, coefficients, block, Samples::U8, seen)
+                self.cut_codes(v, bounds, beside, block, Samples::U8, seen)
             }
             Samples::U16(v) => {
                 let seen = |c: u16| visible[usize::from(c)];
-                self.cut_codes(v, bounds, coefficients, block, Samples::U16, seen)
+                let values: Option<Vec<u8>> = match &self.info.summary.palette {
+                    Some(palette) if self.needs.normals || self.needs.gradients => {
+                        Some(v.iter().map(|&place| palette.value_of(place)).collect())
+                    }
+                    _ => None,
+                };
+                beside.values = values.as_deref();
+                self.cut_codes(v, bounds, beside, block, Samples::U16, seen)
             }
             Samples::F32(v) => {
                 let seen = |c: f32| self.needs.support.contains(f64::from(c));
-                self.cut_codes(v, bounds, coefficients, block, Samples::F32, seen)
+                self.cut_codes(v, bounds, beside, block, Samples::F32, seen)
             }
         }
     }
@@ -96,7 +113,7 @@ impl<'a> Cutter<'a> {
         &self,
         codes: &[T],
         (from, to): ([u32; 3], [u32; 3]),
-        coefficients: Option<&SampleBox<'_>>,
+        Beside { coefficients, values }: Beside<'_>,
         (lo, hi): ([u32; 3], [u32; 3]),
         samples: fn(Vec<T>) -> Samples,
         relevant: impl Fn(T) -> bool,
@@ -105,6 +122,7 @@ impl<'a> Cutter<'a> {
         let size = std::array::from_fn(|a| (to[a] - from[a]) as usize);
         let lattice: &Lattice = &self.info.lattice;
         let field = Codes { codes, lo: from, size, dims: lattice.dims };
+        let values = values.map(|codes| Codes { codes, lo: from, size, dims: lattice.dims });
         let is_inside = |voxel| self.crop.is_none_or(|c| c.contains(lattice, voxel));
         let near = (needs.halo > 0).then(|| {
             let first = std::array::from_fn(|a| lo[a].saturating_sub(needs.halo));
@@ -142,7 +160,11 @@ impl<'a> Cutter<'a> {
             let gradient = |(&i, &offset)| {
                 let local = local_position(i);
                 let voxel = std::array::from_fn(|a| corner[a] + local[a]);
-                self.gradient_matrix * field.central_difference(voxel, offset)
+                self.gradient_matrix
+                    * match &values {
+                        Some(values) => values.central_difference(voxel, offset),
+                        None => field.central_difference(voxel, offset),
+                    }
             };
             let all = || index.iter().zip(offsets).map(gradient);
             let normals = needs.normals.then(|| all().map(encode_normal).collect());

@@ -407,7 +407,7 @@ pub fn estimate(
     let info = &source.levels()[level];
     let summaries = source.summaries(level)?;
     let same = SameBlocks::new(&summaries, needs, None);
-    let sample = if needs.coefficients { 4 } else { info.summary.kind.bytes() as u64 };
+    let sample = if needs.coefficients { 4 } else { info.summary.code_kind().bytes() as u64 };
     let voxel = sample + 2 * u64::from(needs.normals) + u64::from(needs.gradients);
     let mut all = Estimate::default();
     for block in (0..summaries.all.len()).filter(|&block| same.may_hold(block)) {

@@ -314,3 +314,58 @@ fn window_holds_the_bricks_of_its_blocks_and_no_others() {
         assert_eq!(part.encoded(info.id), whole.encoded(info.id));
     }
 }
+
+#[test]
+fn bricks_of_colours_hold_places_and_normals_of_the_values() {
+    use slabcast_common::volume::{ColourValue, Palette};
+    let colours = (0..=255u8).map(|i| [255 - i, 3, i, 255 - i]).collect();
+    let palette = Palette::sorted(colours, true, ColourValue::Alpha).expect("256 colours");
+    let n = 11;
+    let lattice = Lattice::from_spacing([n; 3], [1.0, 1.0, 2.0]);
+    let places: Vec<u16> = (0..n * n * n).map(|i| (i * i % 251) as u16).collect();
+    let volume =
+        Volume::coloured("c", "RGBA uint8", false, lattice, palette.into(), places.clone());
+    let volume = volume.expect("places in it");
+    let grey =
+        Volume::new("g", "uint8", false, lattice, volume.samples.clone(), ValueMap::IDENTITY);
+    let needs =
+        |support| BrickNeeds { support, normals: true, gradients: true, ..BrickNeeds::default() };
+    // Values ascend with places.
+    let (from, to) = (volume.summary.palette.as_ref().unwrap().value_of(40), 255);
+    let store = BrickStore::build(&volume, volume.digest(), &needs(span(40.0, 255.0)));
+    let values = span(f64::from(from), f64::from(to));
+    let of_grey = BrickStore::build(&grey, grey.digest(), &needs(values));
+    assert_eq!(store.infos().len(), of_grey.infos().len());
+    for info in store.infos().iter() {
+        let (a, b) = (store.brick(info.id).unwrap(), of_grey.brick(info.id).unwrap());
+        assert_eq!((&a.index, &a.normals, &a.gradients), (&b.index, &b.normals, &b.gradients));
+        let Samples::U16(found) = &a.values else { panic!("places have 16 bits") };
+        let palette = volume.summary.palette.as_ref().unwrap();
+        assert!(found.iter().zip(0..).all(|(&place, i)| {
+            f64::from(palette.value_of(place)) == b.values.code(i) && place >= 40
+        }));
+    }
+}
+
+#[test]
+fn edit_of_a_function_of_colours_cuts_what_a_new_store_holds() {
+    use slabcast_common::volume::{ColourValue, Palette};
+    let colours = (0..6000u32).map(|i| [(i % 250) as u8, (i / 250) as u8, 7, 255]).collect();
+    let palette = Palette::sorted(colours, false, ColourValue::Luminance).expect("distinct");
+    let dims = [200, 66, 5];
+    let lattice = Lattice::from_spacing(dims, [1.0; 3]);
+    let place = |i: u32| (i % 200 * 30 + i / 13200) as u16;
+    let places = (0..dims.iter().product()).map(place).collect();
+    let volume = Volume::coloured("c", "RGB uint8", false, lattice, palette.into(), places);
+    let volume = Arc::new(volume.expect("places in it"));
+    let digest = volume.digest();
+    let source: Arc<dyn BlockSource> = Arc::new(MemorySource::new(volume.clone(), digest));
+    let needs = |lo, hi| BrickNeeds { support: span(lo, hi), ..BrickNeeds::default() };
+    let before = BrickStore::cut(&source, 0, &needs(100.0, 1500.0), None, u64::MAX).unwrap();
+    for (lo, hi) in [(100.0, 1501.0), (3000.0, 5999.0), (90.0, 1500.0), (100.0, 1500.0)] {
+        let needs = needs(lo, hi);
+        let after = BrickStore::cut(&source, 0, &needs, Some(&before), u64::MAX).unwrap();
+        assert_same(&after, &BrickStore::build(&volume, digest, &needs));
+        assert!(after.relevant_voxels() > 0);
+    }
+}

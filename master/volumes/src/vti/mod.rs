@@ -15,9 +15,11 @@ mod tags;
 
 use crate::error::{Problem, quoted};
 use crate::limit::ByteCap;
+use crate::pick::{Axis, Part};
 use crate::samples::{self, Endian, Layout, Number, Supply};
 use crate::source::{BUFFER_BYTES, Notes, Source, Stream};
 use crate::unpack::{Base64, Encoding};
+use crate::{colours, data};
 use blocks::{Blocks, Compressor};
 use glam::{DMat3, DVec3};
 use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
@@ -37,12 +39,18 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 
 /// Reads a volume from the start of a source; `dataset` names its array.
 pub(crate) fn read(source: Source, name: &str, dataset: Option<&str>) -> Result<Volume, Problem> {
-    source.pick.choose(&[], "content")?;
-    let (len, cap, notes) = (source.len, source.cap.clone(), source.notes.clone());
+    let (len, cap, notes, pick) =
+        (source.len, source.cap.clone(), source.notes.clone(), source.pick);
     let stream = SharedStream(Arc::new(Mutex::new(source.reader.into_inner())));
     let arrays = Arrays::find(stream.reader(0)?, dataset)?;
     let Arrays { file, image, drawn, names, .. } = &arrays;
     let (array, place) = drawn;
+    let colours = colours::may_be_colours(array.components, array.number);
+    let numbers = Axis::of_voxel("numbers", array.components, colours);
+    let field = format!("DataArray {}", quoted(&array.name));
+    let (channel, said) = pick.choose(&[numbers], &field)?;
+    said.into_iter().for_each(|note| notes.add(note));
+    let channel = channel[0];
     if names.len() > 1 && dataset.is_none() {
         let others: Vec<String> =
             names.iter().filter(|n| **n != array.name).take(8).map(|n| quoted(n)).collect();
@@ -63,10 +71,11 @@ pub(crate) fn read(source: Source, name: &str, dataset: Option<&str>) -> Result<
         let (dims, _) = image.dims_and_origin(mask.cells)?;
         let layout = Layout::new(dims, mask.number, file.endian, "ImageData WholeExtent")?;
         let cap = ByteCap { asked: cap.asked, ..ByteCap::default() };
-        let (codes, map) = read_array(file, &layout, open(place)?, cap).map_err(|mut p| {
-            p.field = format!("DataArray {} {}", quoted(&mask.name), p.field);
-            p
-        })?;
+        let (codes, map) =
+            read_array(file, (&layout, None), open(place)?, cap).map_err(|mut p| {
+                p.field = format!("DataArray {} {}", quoted(&mask.name), p.field);
+                p
+            })?;
         hidden.resize(codes.len(), false);
         let flags = hidden.iter_mut().enumerate();
         let count = flags.fold(0u64, |count, (i, hidden)| {
@@ -84,7 +93,7 @@ pub(crate) fn read(source: Source, name: &str, dataset: Option<&str>) -> Result<
         }
     }
     let beside = cap.beside.clone();
-    let mut volume = finish(file, image, array, open(place)?, (name, cap))?;
+    let mut volume = finish(file, image, (array, channel), open(place)?, (name, cap))?;
     if hidden.contains(&true) {
         // The numbers would show what is not there.
         beside.take_numbers();
@@ -161,6 +170,8 @@ impl Arrays {
         let (mut file, mut image, mut section) = (None, None, None);
         let (mut drawn, mut names, mut masks): (Option<(Array, Place)>, _, _) =
             (None, Vec::new(), Vec::new());
+        // The first array of several numbers a point, if no other is there.
+        let mut several: Option<(Array, Place)> = None;
         let mut appended = None;
         let outside = |tag: &Tag| {
             Problem::malformed(tag.name.as_str(), "does not stand inside ImageData", RESAVE)
@@ -192,6 +203,11 @@ impl Arrays {
                         false if drawn.is_none() => section.select(&tag, dataset)?,
                         false => None,
                     };
+                    let spare = drawn.is_none() && several.is_none() && dataset.is_none();
+                    let found = match found {
+                        None if spare && !is_mask && !is_single(&tag) => Some(section.array(&tag)?),
+                        found => found,
+                    };
                     let Some(array) = found else { continue };
                     if file.is_none() || image.is_none() {
                         return Err(outside(&tag));
@@ -209,6 +225,13 @@ impl Arrays {
                     match is_mask {
                         true if masks.len() < MASKS.len() => masks.push((array, place)),
                         true => {}
+                        false
+                            if array.components > 1
+                                && dataset.is_none()
+                                && !section.is_active(&array) =>
+                        {
+                            several = Some((array, place));
+                        }
                         false => drawn = Some((array, place)),
                     }
                 }
@@ -225,7 +248,7 @@ impl Arrays {
                 _ => {}
             }
         }
-        match (file, image, drawn) {
+        match (file, image, drawn.or(several)) {
             (Some(file), Some(image), Some(drawn)) => {
                 Ok(Arrays { file, image, drawn, names, masks, appended })
             }
@@ -244,8 +267,8 @@ impl Arrays {
             }
             _ => Err(Problem::unsupported(
                 "DataArray",
-                "there is none with one number a point or cell",
-                "save a volume with one component",
+                "there is none that can be drawn",
+                "save a volume of numbers",
             )),
         }
     }
@@ -386,6 +409,8 @@ struct Section {
 struct Array {
     name: String,
     number: Number,
+    /// Numbers of each point or cell.
+    components: u64,
     cells: bool,
 }
 
@@ -395,25 +420,24 @@ impl Section {
         Section { scalars, cells }
     }
 
+    /// Returns whether an array has the name of the active scalars.
+    fn is_active(&self, array: &Array) -> bool {
+        self.scalars.as_ref() == Some(&array.name)
+    }
+
     /// Returns the array of a `DataArray` tag if it is the one to draw. `dataset` names that.
     fn select(&self, tag: &Tag, dataset: Option<&str>) -> Result<Option<Array>, Problem> {
         let name = tag.get("Name").unwrap_or_default();
         let one = is_single(tag);
         if let Some(asked) = dataset {
-            return (one && asked == name).then(|| self.array(tag)).transpose();
+            return (asked == name).then(|| self.array(tag)).transpose();
         }
         match &self.scalars {
             // Active scalars that are no volume say nothing.
             Some(scalars) if scalars != name && !MASKS.contains(&scalars.as_str()) => {
                 return Ok(None);
             }
-            Some(scalars) if scalars == name && !one => {
-                return Err(Problem::unsupported(
-                    format!("DataArray {}", quoted(name)),
-                    "has several numbers a point",
-                    "save one component as the active scalars",
-                ));
-            }
+            Some(scalars) if scalars == name && !MASKS.contains(&name) => {}
             _ if !one => return Ok(None),
             _ => {}
         }
@@ -436,7 +460,11 @@ impl Section {
             "Float64" => Number::F64,
             _ => return Err(tag.bad("type", "an integer or float type such as UInt8 or Float32")),
         };
-        Ok(Array { name: name.to_string(), number, cells: self.cells })
+        let components = match is_single(tag) {
+            true => 1,
+            false => tag.numbers::<u64, 1>("NumberOfComponents")?.map_or(1, |[n]| n),
+        };
+        Ok(Array { name: name.to_string(), number, components, cells: self.cells })
     }
 }
 
@@ -474,7 +502,7 @@ enum DataFormat {
 fn finish(
     file: &File,
     image: &Image,
-    array: &Array,
+    (array, channel): (&Array, u64),
     (format, reader, left): Data,
     (name, cap): (&str, ByteCap),
 ) -> Result<Volume, Problem> {
@@ -490,37 +518,52 @@ fn finish(
     lattice.check().map_err(|e| {
         Problem::malformed("ImageData Spacing", e, "correct the spacing or the axes")
     })?;
+    let in_array = |mut p: Problem| {
+        p.field = format!("DataArray {} {}", quoted(&array.name), p.field);
+        p
+    };
+    let [ni, nj, nk] = layout.dims.map(u64::from);
+    let part = Part::new(
+        &[array.components, ni, nj, nk],
+        vec![Some(channel), None, None, None],
+        array.number.bytes(),
+    );
+    let Some(part) = part.filter(|part| part.whole_bytes() > 0) else {
+        return Err(in_array(Problem::malformed(
+            "NumberOfComponents",
+            format!("{} are more than can be", array.components),
+            "correct it",
+        )));
+    };
+    let part = (array.components > 1).then_some(&part);
     let (samples, map) =
-        read_array(file, &layout, (format, reader, left), cap).map_err(|mut p| {
-            p.field = format!("DataArray {} {}", quoted(&array.name), p.field);
-            p
-        })?;
+        read_array(file, (&layout, part), (format, reader, left), cap).map_err(in_array)?;
     Ok(crate::stream::volume(name, array.number.name(), false, lattice, samples, map))
 }
 
+/// Reads an array, or the part of it that is one of its components.
 fn read_array(
     file: &File,
-    layout: &Layout,
+    (layout, part): (&Layout, Option<&Part>),
     (format, reader, left): Data,
     cap: ByteCap,
 ) -> Result<(Samples, ValueMap), Problem> {
+    let read = |reader: &mut (dyn Read + Send), supply: Supply, layout: &Layout| match part {
+        None => samples::read(reader, supply, layout, cap),
+        Some(part) => data::read_part(reader, supply, part, layout, cap),
+    };
     if format == DataFormat::Text {
         let text = Box::new(blocks::UntilTag { inner: reader });
         let (mut reader, supply) = Encoding::Ascii
             .open(text, left, layout.number, &Notes::default())
             .map_err(|e| Problem::io("data", &e))?;
-        return samples::read(
-            &mut *reader,
-            supply,
-            &Layout { endian: Endian::Little, ..*layout },
-            cap,
-        );
+        return read(&mut *reader, supply, &Layout { endian: Endian::Little, ..*layout });
     }
     let mut data = match format {
         DataFormat::Raw => Bytes::Raw(reader),
         _ => Bytes::Base64(Base64::new(reader)),
     };
-    let need = layout.bytes();
+    let need = part.map_or(layout.bytes(), Part::whole_bytes);
     let word = |data: &mut Bytes| -> Result<u64, Problem> {
         let mut bytes = [0; 8];
         data.read_exact(&mut bytes[..file.header_word_bytes])
@@ -549,7 +592,7 @@ fn read_array(
             }
             _ => Supply::Encoded { name: "base64", bytes: left, ratio: 1 },
         };
-        return samples::read(&mut data.take(need), supply, layout, cap);
+        return read(&mut data.take(need), supply, layout);
     };
     let [count, size, last] = [word(&mut data)?, word(&mut data)?, word(&mut data)?];
     let whole = if last == 0 { count } else { count.saturating_sub(1) };
@@ -573,7 +616,7 @@ fn read_array(
         return Err(samples::truncated(bytes, left));
     }
     let mut blocks = Blocks::new(compressor, Box::new(data), packed, [size, last]);
-    samples::read(&mut blocks, compressor.supply(bytes), layout, cap)
+    read(&mut blocks, compressor.supply(bytes), layout)
 }
 
 /// Binary data, raw or in base64.

@@ -211,8 +211,8 @@ fn vti_errors_name_field_and_remedy() {
         (with("Extent=\"1 5 0 2 0 1\"><", "Extent=\"1 3 0 2 0 1\"><"), "Piece: is one of several"),
         (with("Spacing=\"1 2 3\"", "Spacing=\"1 0 3\""), "Spacing: a spacing is zero"),
         (with("UInt8\" Name=\"v", "String\" Name=\"v"), "DataArray type: `String`"),
-        (with("Scalars=\"v\"", "Scalars=\"other\""), "`other`: has several numbers a point"),
-        (with("Scalars=\"v\"", "Scalars=\"none\""), "DataArray: there is none with one number"),
+        (with("Scalars=\"v\"", "Scalars=\"other\""), "`other`: a voxel is 3 numbers"),
+        (with("Scalars=\"v\"", "Scalars=\"none\""), "`other`: a voxel is 3 numbers, not one"),
         (with("29<", "299<"), "number 30 is `299`, which is not a value of uint8"),
         (with("28 29<", "28<"), "`v` data: truncated: 30 bytes are needed and 29"),
         (with("29<", "29 30<"), "goes on after the 30 bytes"),
@@ -280,5 +280,5 @@ fn vti_masks_before_or_after_the_array_hide_points_and_cells() {
     assert_eq!(notes.take(), ["the array `v` was read, and `w` was not (--dataset takes another)"]);
     let masks = file("PointData", &[("UInt8", "vtkGhostType", "0 2 1 3")]);
     let e = open(masks.into_bytes()).unwrap_err().to_string();
-    assert!(e.contains("there is none with one number a point or cell"), "{e}");
+    assert!(e.contains("there is none that can be drawn"), "{e}");
 }

@@ -2,7 +2,8 @@
 
 use super::shared::{
     background_from_wire, background_to_wire, format_from_wire, format_to_wire, kind_from_wire,
-    kind_to_wire, quality_from_wire, quality_to_wire, transfer_from_wire, transfer_to_wire,
+    kind_to_wire, palette_to_wire, quality_from_wire, quality_to_wire, transfer_from_wire,
+    transfer_to_wire, with_palette,
 };
 use super::{digest_from_wire, required, wire};
 use crate::convert::WireError;
@@ -39,6 +40,7 @@ fn volume_to_wire(info: &VolumeInfo) -> wire::Volume {
         infinite_samples: s.infinite,
         level: info.level,
         finest_vox: if info.level == 0 { 0.0 } else { info.finest_vox },
+        palette: s.palette.as_deref().map(palette_to_wire),
     }
 }
 
@@ -63,6 +65,7 @@ fn volume_from_wire(info: wire::Volume) -> Result<VolumeInfo, WireError> {
         infinite_samples: info.infinite_samples,
     };
     let summary = summary_from_fields(kind_from_wire("kind", info.kind)?, fields)?;
+    let summary = with_palette(summary, info.palette)?;
     let finest_vox = finest_vox_from_wire(&lattice, info.level, info.finest_vox)?;
     let (digest, level) = (digest_from_wire("digest", &info.digest)?, info.level);
     Ok(VolumeInfo { digest, lattice, summary, level, finest_vox })
@@ -107,6 +110,12 @@ pub fn scene_from_wire(scene: wire::Scene) -> Result<SceneSpec, WireError> {
         .map_err(|e| e.within("quality"))?;
     if quality.sums == Sums::Auto {
         return Err(WireError::value("quality.sums", "is undecided; a scene says which sums"));
+    }
+    if volume.summary.palette.is_some() && quality.classify == Classify::After {
+        return Err(WireError::value(
+            "quality.classify",
+            "is AFTER; colours are classified before",
+        ));
     }
     let bricks = BrickSetKey(digest_from_wire("set", &scene.set)?);
     let crop = crop_from_wire(&scene.crop)?;

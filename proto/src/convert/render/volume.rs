@@ -1,6 +1,8 @@
 //! Volumes: what DescribeVolume and ListVolumes answer, and the parts of an upload.
 
-use super::shared::{kind_from_wire, kind_to_wire, vec3_from_wire, vec3_to_wire};
+use super::shared::{
+    kind_from_wire, kind_to_wire, palette_to_wire, vec3_from_wire, vec3_to_wire, with_palette,
+};
 use super::{axis_from_wire, axis_to_wire, enum_conversions, wire};
 use crate::convert::numbers::{
     SummaryFields, check_lattice, finest_vox_from_wire, finite, summary_from_fields,
@@ -258,6 +260,7 @@ fn info_to_wire(info: &VolumeInfo) -> wire::Volume {
         }),
         level: info.level,
         finest_vox: if info.level == 0 { 0.0 } else { info.finest_vox },
+        palette: s.palette.as_deref().map(palette_to_wire),
     }
 }
 
@@ -289,6 +292,7 @@ fn info_from_wire(info: wire::Volume) -> Result<VolumeInfo, WireError> {
     let core = info.core.map(core_from_wire).transpose().map_err(|e| e.within("core"))?;
     let summary =
         ValueSummary { anatomical: info.anatomical, core, ..summary_from_fields(kind, fields)? };
+    let summary = with_palette(summary, info.palette)?;
     let finest_vox = finest_vox_from_wire(&lattice, info.level, info.finest_vox)?;
     let (digest, level) = (digest_from_wire("digest", &info.digest)?, info.level);
     Ok(VolumeInfo { digest, lattice, summary, level, finest_vox })

@@ -10,6 +10,7 @@ use slabcast_common::brick::Brick;
 use slabcast_common::crop::CropBox;
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::{FrameState, Picture};
+use slabcast_common::math::linear_from_srgb;
 use slabcast_common::message::{Counters, SceneSpec};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Classify, Compositing, Kernel, Quality, Sums};
@@ -17,7 +18,7 @@ use slabcast_common::shade::{Light, Shading};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
-use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
+use slabcast_common::volume::{ColourValue, Digest32, Lattice, Palette, Samples, ValueMap, Volume};
 use slabcast_render::Simd;
 use slabcast_render::oracle::serial;
 use slabcast_render::oracle::work_counters::count_work;
@@ -376,4 +377,125 @@ fn nan_infinite_and_huge_samples_give_finite_pixels() {
     let picture = serial::render(&frame, &bricks_of(&v));
     assert!(picture.pixels.iter().flatten().all(|x| x.is_finite()));
     assert!(picture.pixels.iter().any(|p| p[3] > 0.9));
+}
+
+/// A ball of red, green, blue and white parts in black. The same values with a transfer function that
+/// has these colours are another way to say it.
+#[test]
+fn colours_of_a_palette_are_drawn_as_a_function_with_the_same_colours_is() {
+    let colours: [[u8; 3]; 5] = [[0; 3], [10, 30, 255], [255, 0, 20], [0, 200, 90], [255; 3]];
+    let palette: Vec<[u8; 4]> = colours.iter().map(|&[r, g, b]| [r, g, b, 255]).collect();
+    let palette = Palette::new(palette, false, ColourValue::Luminance).expect("they ascend");
+    let palette = Arc::new(palette);
+    let n = 20u32;
+    let place = |i: u32, j: u32, k: u32| {
+        let d = [i, j, k].map(|x| f64::from(x) - 9.5);
+        let inside = d.iter().map(|x| x * x).sum::<f64>() < 64.0;
+        if inside { 1 + (i / 4 + j / 4 + k / 4) as u16 % 4 } else { 0 }
+    };
+    let places: Vec<u16> = (0..n * n * n).map(|at| place(at % n, at / n % n, at / n / n)).collect();
+    let lattice = Lattice::from_spacing([n; 3], [1.0; 3]);
+    let coloured =
+        Volume::coloured("c", "RGB uint8", false, lattice, palette.clone(), places).unwrap();
+    let grey =
+        Volume::new("g", "uint8", false, lattice, coloured.samples.clone(), ValueMap::IDENTITY);
+    for (top, shading) in [(1.0, Shading::default()), (0.2, Shading::default())] {
+        let look = TransferFunction {
+            color_space: ColorSpace::Srgb,
+            shading,
+            ..transfer(
+                palette
+                    .colours()
+                    .iter()
+                    .map(|&c| {
+                        let [r, g, b] = [c[0], c[1], c[2]].map(|x| f64::from(x) / 255.0);
+                        [f64::from(palette.value().of(c)), r, g, b]
+                    })
+                    .collect(),
+                vec![[0.0, 0.0], [20.0, top]],
+                OpacityUnit::AlphaPerVox,
+            )
+        };
+        // The colours of the function do not count where voxels have their own.
+        let other = TransferFunction { colors: vec![[0.0, 0.1, 0.9, 0.4]], ..look.clone() };
+        for projection in [
+            CameraProjection::Ortho { height: 24.0 },
+            CameraProjection::Persp { fov: 40.0, distance: 40.0 },
+        ] {
+            let camera = Camera {
+                to_eye: DVec3::new(0.3, 1.0, 0.4),
+                up: DVec3::Z,
+                target: DVec3::ZERO,
+                projection,
+            };
+            let draw = |v: &Volume, transfer: &TransferFunction, quality: Quality| {
+                let spec = SceneSpec {
+                    id: SceneId(1),
+                    volume: v.info(Digest32::default()),
+                    transfer: transfer.clone(),
+                    quality,
+                    crop: None,
+                    bricks: Default::default(),
+                };
+                let drawn = quality.for_volume(&spec.volume.summary);
+                let view = View::new(&v.lattice, &camera, [70, 60], &drawn).unwrap();
+                let frame = Frame::new(Arc::new(Scene::new(&spec)), view);
+                let bricks = bricks_of(v);
+                let whole = bricks
+                    .iter()
+                    .filter_map(|b| view.project(&b.tight_box(&frame.scene.grid)))
+                    .fold(SheetRange::default(), |r, p| r.union(p.sheets));
+                let want = serial::render(&frame, &bricks);
+                for (simd, edge) in [(Simd::detect(), 16), (Simd::plain(), 64)] {
+                    assert!(tiled(&frame, simd, &bricks, edge, &[whole]).0 == want);
+                }
+                want
+            };
+            for sums in [Sums::I16, Sums::I32] {
+                let quality = Quality { sums, ..Quality::before() };
+                let want = draw(&grey, &look, quality);
+                assert!(want.pixels.iter().any(|p| p[0] > 2.0 * p[1] && p[3] > 0.5), "some red");
+                assert!(draw(&coloured, &other, quality) == want, "{top} {projection:?} {sums:?}");
+                let after = Quality { sums, ..Quality::default() };
+                assert!(draw(&coloured, &other, after) == want, "never classified after");
+            }
+        }
+    }
+}
+
+/// Colour of an opaque block, unlit: its own.
+#[test]
+fn opaque_colours_are_seen_as_they_are() {
+    let rgb = [200u8, 90, 30];
+    let palette = vec![[rgb[0], rgb[1], rgb[2], 255]];
+    let palette = Palette::new(palette, false, ColourValue::Luminance).unwrap();
+    let lattice = Lattice::from_spacing([16; 3], [1.0; 3]);
+    let v = Volume::coloured("c", "RGB uint8", false, lattice, palette.into(), vec![0; 4096]);
+    let v = v.unwrap();
+    let look = transfer(vec![[0.0; 4]], vec![[0.0, 1.0]], OpacityUnit::AlphaPerVox);
+    let quality = Quality { sums: Sums::I32, ..Quality::before() };
+    let spec = SceneSpec {
+        id: SceneId(1),
+        volume: v.info(v.digest()),
+        transfer: look,
+        quality,
+        crop: None,
+        bricks: Default::default(),
+    };
+    let camera = Camera {
+        to_eye: DVec3::new(0.2, 1.0, 0.1),
+        up: DVec3::Z,
+        target: DVec3::ZERO,
+        projection: CameraProjection::Ortho { height: 20.0 },
+    };
+    let view = View::new(&v.lattice, &camera, [41, 41], &quality).unwrap();
+    let frame = Frame::new(Arc::new(Scene::new(&spec)), view);
+    let picture = serial::render(&frame, &bricks_of(&v));
+    let middle = picture.pixels[20 * 41 + 20];
+    let want = rgb.map(|c| linear_from_srgb(f64::from(c) / 255.0));
+    for c in 0..3 {
+        let off = (f64::from(middle[c] / middle[3]) - want[c]).abs();
+        assert!(off < 0.5 / 255.0, "channel {c}: {middle:?}, not {want:?}");
+    }
+    assert!(middle[3] > 0.99);
 }

@@ -17,7 +17,7 @@ mod sweep;
 use super::case::number;
 use super::scenes::SCENES;
 use crate::plot;
-use slabcast_common::quality::{Classify, Work};
+use slabcast_common::quality::{Classify, Quality, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_scene::path::{Orientation, ProjectionKind, Turntable, ViewPath};
 use slabcast_session::fail::{Fail, say};
@@ -164,11 +164,12 @@ fn subjects<'a>(
             Some(json) => TransferFunction::from_json(json)
                 .map_err(|e| Fail::failed(format!("{name}: {e}")))?,
             None => {
-                request.fit(&info, orientation, volume.anatomical)?;
+                request.clone().fit(&info, orientation, volume.anatomical)?;
                 request.transfer.function(&info).map_err(|e| request.blame(&e))?
             }
         };
         let pixels = args.pixels as usize;
+        let quality = Quality::for_volume(quality, &info.summary);
         Ok(SweepScene { name, volume, info, transfer, quality, size, pixels, seed: args.seed })
     };
     if args.volumes.is_empty() {

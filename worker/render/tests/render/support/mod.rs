@@ -71,7 +71,7 @@ pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
     for id in 0..grid.len() as u32 {
         let corner = grid.corner(BrickId(id));
         let (mut index, mut normals) = (Vec::new(), Vec::new());
-        let mut values = Samples::empty(volume.samples.kind());
+        let mut values = Samples::empty(volume.codes().kind());
         for l in 0..512u16 {
             let p: [u32; 3] = std::array::from_fn(|a| corner[a] + local_position(l)[a]);
             if (0..3).any(|a| p[a] >= volume.lattice.dims[a]) {
@@ -80,7 +80,7 @@ pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
             let i = (p[2] as usize * ny + p[1] as usize) * nx + p[0] as usize;
             if volume.samples.code(i) != 0.0 {
                 index.push(l);
-                values.push_from(&volume.samples, i);
+                values.push_from(volume.codes(), i);
                 normals.push(encode_normal(volume.gradient(p, &matrix)));
             }
         }

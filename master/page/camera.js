@@ -24,14 +24,30 @@ export const cross = (a, b) => [
 /** @type {(a: Vec3) => Vec3} */
 export const unitOf = (a) => times(a, 1 / Math.hypot(...a));
 
-/** Returns `x` with `digits` significant digits. @param {number} x @param {number} digits */
+/**
+ * Returns `x` with `digits` significant digits.
+ * @param {number} x
+ * @param {number} digits
+ */
 export const significant = (x, digits) => Number(x.toPrecision(digits));
-/** Returns `x` rounded to a multiple of `step`, 10^n. @param {number} x @param {number} step */
+/**
+ * Returns `x` rounded to a multiple of `step`, 10^n.
+ * @param {number} x
+ * @param {number} step
+ */
 export const rounded = (x, step) => Number((Math.round(x / step) * step).toPrecision(12));
-/** @param {number} x @param {number} lo @param {number} hi */
+/**
+ * @param {number} x
+ * @param {number} lo
+ * @param {number} hi
+ */
 export const clamp = (x, lo, hi) => Math.min(Math.max(x, lo), hi);
 
-/** Returns the vector of an axis such as `+z` or `-y`. @param {string} text @returns {Vec3} */
+/**
+ * Returns the vector of an axis such as `+z` or `-y`.
+ * @param {string} text
+ * @returns {Vec3}
+ */
 export function axisVector(text) {
   const index = "xyz".indexOf(text.slice(-1));
   /** @type {Vec3} */
@@ -42,7 +58,9 @@ export function axisVector(text) {
 
 /**
  * Returns the axes of a volume. A front that lies along up is replaced as `--front` is when left out.
- * @param {string} up @param {string} front @returns {Axes}
+ * @param {string} up
+ * @param {string} front
+ * @returns {Axes}
  */
 export function axesOf(up, front) {
   const u = up.slice(-1);
@@ -52,7 +70,10 @@ export function axesOf(up, front) {
   return { up: upV, front: frontV, side, hand: dot(side, cross(frontV, upV)) > 0 ? 1 : -1 };
 }
 
-/** Sine and cosine of degrees, exact at multiples of 90. @param {number} degrees */
+/**
+ * Sine and cosine of degrees, exact at multiples of 90.
+ * @param {number} degrees
+ */
 export function sinCosDegrees(degrees) {
   const quarter = Math.round(degrees / 90);
   const rest = (degrees - quarter * 90) * (Math.PI / 180);
@@ -62,7 +83,9 @@ export function sinCosDegrees(degrees) {
 
 /**
  * Direction to the eye and the picture's up, without roll. Up is at right angles: there is no pole.
- * @param {Axes} o @param {number} azimuth @param {number} elevation
+ * @param {Axes} o
+ * @param {number} azimuth
+ * @param {number} elevation
  * @returns {{toEye: Vec3, up: Vec3}}
  */
 export function eyeDirection(o, azimuth, elevation) {
@@ -75,7 +98,11 @@ export function eyeDirection(o, azimuth, elevation) {
   };
 }
 
-/** Returns the eye's axes in the world. @param {Cam} cam @param {Axes} o */
+/**
+ * Returns the eye's axes in the world.
+ * @param {Cam} cam
+ * @param {Axes} o
+ */
 export function eyeAxes(cam, o) {
   const { toEye, up } = eyeDirection(o, cam.azimuth, cam.elevation);
   const ahead = times(toEye, -1);
@@ -89,7 +116,10 @@ export function eyeAxes(cam, o) {
   return { right, down, ahead, toEye };
 }
 
-/** Distance from eye to target in mm. In parallel projection any will do. @param {Cam} cam */
+/**
+ * Distance from eye to target in mm. In parallel projection any will do.
+ * @param {Cam} cam
+ */
 export function eyeDistance(cam) {
   if (cam.projection === "ortho") return 2 * cam.height;
   return cam.height / 2 / Math.tan((cam.fov * Math.PI) / 360);
@@ -97,7 +127,8 @@ export function eyeDistance(cam) {
 
 /**
  * Returns the camera as a key of a view path (docs/reference/view-paths.md).
- * @param {Cam} cam @param {Axes} o
+ * @param {Cam} cam
+ * @param {Axes} o
  */
 export function keyOfCam(cam, o) {
   /** @type {Record<string, any>} */
@@ -121,7 +152,10 @@ export function keyOfCam(cam, o) {
 
 /**
  * Returns the camera of a key of a view path; what it leaves out comes from `home`.
- * @param {any} key @param {Axes} o @param {Cam} home @returns {Cam}
+ * @param {any} key
+ * @param {Axes} o
+ * @param {Cam} home
+ * @returns {Cam}
  */
 export function camOfKey(key, o, home) {
   /** @type {Cam} */
@@ -129,7 +163,7 @@ export function camOfKey(key, o, home) {
     ...home, roll: 0,
     projection: key.projection === "persp" ? "persp" : "ortho",
     fov: key.fov ?? 30,
-    target: key.target ? [...key.target] : home.target,
+    target: /** @type {Vec3} */ (key.target ? [...key.target] : home.target),
     height: key.height ?? home.height,
   };
   if (key.view) {
@@ -160,7 +194,12 @@ export function camOfKey(key, o, home) {
 /** Names of the six sides in the order of the keys 1 to 6. */
 export const SIDES = ["anterior", "posterior", "left", "right", "superior", "inferior"];
 
-/** Azimuth and elevation of a side of the body. @param {string} name @param {Axes} o @returns {[number, number]} */
+/**
+ * Azimuth and elevation of a side of the body.
+ * @param {string} name
+ * @param {Axes} o
+ * @returns {[number, number]}
+ */
 export function sideAngles(name, o) {
   // As Side::angles: azimuths grow towards the positive side axis, which need not be the right.
   const right = cross(o.front, o.up);
@@ -180,8 +219,12 @@ const wrap = (azimuth) => rounded(((((azimuth + 180) % 360) + 360) % 360) - 180,
 
 /**
  * Turns the volume with the hand: half a turn for a drag across the picture's height.
- * @param {Cam} cam @param {Axes} o @param {number} dx @param {number} dy  pixels to the right, down
- * @param {number} heightPx @returns {Cam}
+ * @param {Cam} cam
+ * @param {Axes} o
+ * @param {number} dx
+ * @param {number} dy  pixels to the right, down
+ * @param {number} heightPx
+ * @returns {Cam}
  */
 export function turnedBy(cam, o, dx, dy, heightPx) {
   const [s, c] = sinCosDegrees(-cam.roll);
@@ -190,7 +233,14 @@ export function turnedBy(cam, o, dx, dy, heightPx) {
   return steppedBy(cam, o, x * k, y * k);
 }
 
-/** Turns by degrees: to the right, and down. @param {Cam} cam @param {Axes} o @param {number} right @param {number} down @returns {Cam} */
+/**
+ * Turns by degrees: to the right, and down.
+ * @param {Cam} cam
+ * @param {Axes} o
+ * @param {number} right
+ * @param {number} down
+ * @returns {Cam}
+ */
 export function steppedBy(cam, o, right, down) {
   return {
     ...cam,
@@ -199,15 +249,27 @@ export function steppedBy(cam, o, right, down) {
   };
 }
 
-/** Leans the picture clockwise by degrees. @param {Cam} cam @param {number} degrees @returns {Cam} */
+/**
+ * Leans the picture clockwise by degrees.
+ * @param {Cam} cam
+ * @param {number} degrees
+ * @returns {Cam}
+ */
 export const rolledBy = (cam, degrees) => ({ ...cam, roll: wrap(cam.roll + degrees) || 0 });
 
-/** Step to which targets are rounded: a thousandth of what the picture shows in 1000 pixels. @param {Cam} cam */
+/**
+ * Step to which targets are rounded: a thousandth of what the picture shows in 1000 pixels.
+ * @param {Cam} cam
+ */
 const targetStep = (cam) => 10 ** Math.floor(Math.log10(cam.height) - 5);
 
 /**
  * Moves the picture by pixels to the right and down.
- * @param {Cam} cam @param {Axes} o @param {number} dx @param {number} dy @param {number} heightPx
+ * @param {Cam} cam
+ * @param {Axes} o
+ * @param {number} dx
+ * @param {number} dy
+ * @param {number} heightPx
  * @returns {Cam}
  */
 export function pannedBy(cam, o, dx, dy, heightPx) {
@@ -217,7 +279,12 @@ export function pannedBy(cam, o, dx, dy, heightPx) {
   return aimedAt(cam, to);
 }
 
-/** Looks at a point. @param {Cam} cam @param {Vec3} target @returns {Cam} */
+/**
+ * Looks at a point.
+ * @param {Cam} cam
+ * @param {Vec3} target
+ * @returns {Cam}
+ */
 export function aimedAt(cam, target) {
   const step = targetStep(cam);
   return { ...cam, target: /** @type {Vec3} */ (target.map((x) => rounded(x, step))) };
@@ -225,9 +292,13 @@ export function aimedAt(cam, target) {
 
 /**
  * Shows `factor` times the height; the point of the target's plane at (x, y) stays where it is.
- * @param {Cam} cam @param {Axes} o @param {number} factor
- * @param {number} x @param {number} y  pixels from the picture's middle
- * @param {number} heightPx @param {[number, number]} limits  heights in mm
+ * @param {Cam} cam
+ * @param {Axes} o
+ * @param {number} factor
+ * @param {number} x
+ * @param {number} y  pixels from the picture's middle
+ * @param {number} heightPx
+ * @param {[number, number]} limits  heights in mm
  * @returns {Cam}
  */
 export function zoomedAt(cam, o, factor, x, y, heightPx, limits) {
@@ -241,7 +312,9 @@ export function zoomedAt(cam, o, factor, x, y, heightPx, limits) {
 /**
  * Returns a function from world points to [x, y, depth]: pixels of a picture of `size` (width,
  * height) from its top left, and mm behind the target. Points behind the eye are null.
- * @param {Cam} cam @param {Axes} o @param {[number, number]} size
+ * @param {Cam} cam
+ * @param {Axes} o
+ * @param {[number, number]} size
  * @returns {(p: Vec3) => [number, number, number]|null}
  */
 export function projector(cam, o, size) {
@@ -257,20 +330,29 @@ export function projector(cam, o, size) {
   };
 }
 
-/** Middle and largest extent of a box. @param {[Vec3, Vec3]} box @returns {{target: Vec3, height: number}} */
+/**
+ * Middle and largest extent of a box.
+ * @param {[Vec3, Vec3]} box
+ * @returns {{target: Vec3, height: number}}
+ */
 export function boxFraming([lo, hi]) {
   const extent = Math.max(...minus(hi, lo));
   return { target: times(plus(lo, hi), 0.5), height: 1.25 * extent };
 }
 
-/** Letters of a volume's axes, positive and negative ends of x, y, z. @param {boolean} anatomical */
+/**
+ * Letters of a volume's axes, positive and negative ends of x, y, z.
+ * @param {boolean} anatomical
+ */
 export const axisLetters = (anatomical) =>
   anatomical ? [["R", "L"], ["A", "P"], ["S", "I"]] : [["+x", "−x"], ["+y", "−y"], ["+z", "−z"]];
 
 /**
  * Returns what lies to the right of, above, left of and below the middle: one letter, and a second
  * where the picture is oblique.
- * @param {Cam} cam @param {Axes} o @param {boolean} anatomical
+ * @param {Cam} cam
+ * @param {Axes} o
+ * @param {boolean} anatomical
  */
 export function edgeLetters(cam, o, anatomical) {
   const { right, down } = eyeAxes(cam, o);
@@ -287,7 +369,12 @@ export function edgeLetters(cam, o, anatomical) {
   };
 }
 
-/** Says in words where the eye is. @param {Cam} cam @param {Axes} o @param {boolean} anatomical */
+/**
+ * Says in words where the eye is.
+ * @param {Cam} cam
+ * @param {Axes} o
+ * @param {boolean} anatomical
+ */
 export function camWords(cam, o, anatomical) {
   const up = Math.round(cam.elevation);
   const tilt = up === 0 ? "" : `, ${Math.abs(up)}° ${up > 0 ? "up" : "down"}`;
@@ -301,13 +388,18 @@ export function camWords(cam, o, anatomical) {
   return `azimuth ${Math.round(cam.azimuth)}°${tilt}`;
 }
 
-/** Names of sides for what is no body. @param {string} side */
+/**
+ * Names of sides for what is no body.
+ * @param {string} side
+ */
 export const sidePlain = (side) =>
   ({ anterior: "front", posterior: "back", superior: "above", inferior: "below" })[side] ?? side;
 
 /**
  * A scale bar: its length as a round number of mm, at most `most` pixels long.
- * @param {number} mmPerPx @param {number} most @returns {{mm: number, px: number}}
+ * @param {number} mmPerPx
+ * @param {number} most
+ * @returns {{mm: number, px: number}}
  */
 export function scaleBar(mmPerPx, most) {
   const largest = mmPerPx * most;
@@ -316,7 +408,11 @@ export function scaleBar(mmPerPx, most) {
   return { mm, px: mm / mmPerPx };
 }
 
-/** Writes a length. @param {number} mm @param {string} unit */
+/**
+ * Writes a length.
+ * @param {number} mm
+ * @param {string} unit
+ */
 export function lengthWords(mm, unit) {
   if (unit !== "mm") return `${significant(mm, 4)}${unit ? ` ${unit}` : ""}`;
   if (mm >= 1000) return `${significant(mm / 1000, 4)} m`;

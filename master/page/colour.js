@@ -19,7 +19,11 @@ const THUMB_PX = 96;
 /** Presets that are seen before the list is opened: two rows. */
 const FIRST_PRESETS = 8;
 
-/** @param {Core} core @param {import("./overlay.js").Overlay} overlay @param {(tab: string) => void} open */
+/**
+ * @param {Core} core
+ * @param {import("./overlay.js").Overlay} overlay
+ * @param {(tab: string) => void} open
+ */
 export function colourPanel(core, overlay, open) {
   const range = () => /** @type {import("./types.js").Volume} */ (core.volume).range;
   const put = (/** @type {any} */ tf, /** @type {string} */ tag) => core.change({ tf }, tag);
@@ -307,7 +311,14 @@ export function colourPanel(core, overlay, open) {
 /** @param {...string} names */
 const head = (...names) => h("thead", {}, h("tr", {}, ...names.map((n) => h("th", { scope: "col", text: n })), h("td", {})));
 
-/** Makes as many rows as there are entries and fills them. @param {any[]} rows @param {any} body @param {number[][]} list @param {(i: number) => any} make @param {(row: any, entry: number[], i: number) => void} fill */
+/**
+ * Makes as many rows as there are entries and fills them.
+ * @param {any[]} rows
+ * @param {any} body
+ * @param {number[][]} list
+ * @param {(i: number) => any} make
+ * @param {(row: any, entry: number[], i: number) => void} fill
+ */
 function syncRows(rows, body, list, make, fill) {
   while (rows.length > list.length) rows.pop().el.remove();
   while (rows.length < list.length) {

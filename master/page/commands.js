@@ -9,11 +9,17 @@ import { filmPath, stillPath, tfChoice } from "./state.js";
 /** @typedef {import("./types.js").State} State */
 /** @typedef {import("./types.js").Volume} Volume */
 
-/** Quotes a word for a POSIX shell, if need be. @param {string} word */
+/**
+ * Quotes a word for a POSIX shell, if need be.
+ * @param {string} word
+ */
 export const shellWord = (word) =>
   /^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`;
 
-/** @param {State} state @param {Volume} volume */
+/**
+ * @param {State} state
+ * @param {Volume} volume
+ */
 function standingFlags(state, volume) {
   if (volume.anatomical) return [];
   const flags = [];
@@ -34,7 +40,11 @@ function lookFlags(state) {
   return flags;
 }
 
-/** Whether flags alone can say where the camera is. @param {State} state @param {Volume} volume */
+/**
+ * Whether flags alone can say where the camera is.
+ * @param {State} state
+ * @param {Volume} volume
+ */
 export function flagsSuffice(state, volume) {
   const { target } = boxFraming(volume.box);
   const centred = state.cam.target.every((x, i) => Math.abs(x - target[i]) < 1e-9);
@@ -43,7 +53,9 @@ export function flagsSuffice(state, volume) {
 
 /**
  * The command that draws the still, and the files that it reads ({name: text}).
- * @param {State} state @param {Volume} volume @param {[number, number]} size
+ * @param {State} state
+ * @param {Volume} volume
+ * @param {[number, number]} size
  */
 export function stillCommand(state, volume, size) {
   const { cam } = state;
@@ -66,7 +78,9 @@ export function stillCommand(state, volume, size) {
 
 /**
  * The command that makes the movie, and its files.
- * @param {State} state @param {Volume} volume @param {[number, number]} size
+ * @param {State} state
+ * @param {Volume} volume
+ * @param {[number, number]} size
  */
 export function filmCommand(state, volume, size) {
   /** @type {Record<string, string>} */
@@ -78,7 +92,11 @@ export function filmCommand(state, volume, size) {
   return { command: words.map(shellWord).join(" "), files };
 }
 
-/** Files that know their axes refuse others. @param {any} path @param {Volume} volume */
+/**
+ * Files that know their axes refuse others.
+ * @param {any} path
+ * @param {Volume} volume
+ */
 function fileOfPath(path, volume) {
   if (!volume.anatomical) return path;
   const copy = structuredClone(path);
@@ -88,7 +106,10 @@ function fileOfPath(path, volume) {
   return copy;
 }
 
-/** @param {State} state @param {Record<string, string>} files */
+/**
+ * @param {State} state
+ * @param {Record<string, string>} files
+ */
 function namedTf(state, files) {
   const choice = tfChoice(state);
   if (typeof choice === "string") return choice;
@@ -96,7 +117,10 @@ function namedTf(state, files) {
   return "colours.json";
 }
 
-/** The command with its files written before it, to be pasted as a whole. @param {{command: string, files: Record<string, string>}} made */
+/**
+ * The command with its files written before it, to be pasted as a whole.
+ * @param {{command: string, files: Record<string, string>}} made
+ */
 export function pasteable({ command, files }) {
   const written = Object.entries(files).map(([name, text]) => `cat > ${name} <<'END'\n${text}\nEND\n`);
   return `${written.join("")}${command}\n`;
@@ -104,7 +128,8 @@ export function pasteable({ command, files }) {
 
 /**
  * Lines of Python that fetch the same picture from this master (docs/reference/live.md).
- * @param {any} doc @param {string} base  address of the page, without fragment
+ * @param {any} doc
+ * @param {string} base  address of the page, without fragment
  */
 export function pythonLines(doc, base) {
   return `import json, urllib.request

@@ -183,7 +183,9 @@ export class Core extends Signals {
 
   /**
    * Changes the state. Changes of one `tag` that follow each other are one step to undo.
-   * @param {Partial<State>} patch @param {string} tag @param {boolean} [moving]  a hand is on it
+   * @param {Partial<State>} patch
+   * @param {string} tag
+   * @param {boolean} [moving]  a hand is on it
    */
   change(patch, tag, moving = false) {
     if (!this.steps) return;
@@ -193,7 +195,10 @@ export class Core extends Signals {
     this.send(patch, moving);
   }
 
-  /** @param {State} state @param {string} tag */
+  /**
+   * @param {State} state
+   * @param {string} tag
+   */
   adopt(state, tag) {
     this.steps?.push(state, tag, performance.now());
     this.send(state, false);
@@ -205,7 +210,10 @@ export class Core extends Signals {
     if (state) this.send(state, false);
   }
 
-  /** @param {object} patch @param {boolean} moving */
+  /**
+   * @param {object} patch
+   * @param {boolean} moving
+   */
   send(patch, moving) {
     if ("cam" in patch) { this.dirty.view = true; this.moving.view = moving; }
     if (["tf", "crop", "background", "quality", "up", "front"].some((k) => k in patch)) {
@@ -223,7 +231,10 @@ export class Core extends Signals {
     this.schedule();
   }
 
-  /** @param {[number, number]} size @param {number} dpr  of the stage in CSS pixels */
+  /**
+   * @param {[number, number]} size
+   * @param {number} dpr  of the stage in CSS pixels
+   */
   resize([width, height], dpr) {
     const { live_edge: edge, live_pixels: most } = this.welcome.limits;
     let [w, h] = [width * dpr, height * dpr];
@@ -311,18 +322,27 @@ export class Core extends Signals {
     return answer?.ok ? `#s,${(await answer.json()).id}` : null;
   }
 
-  /** @param {string} url @param {any} body */
+  /**
+   * @param {string} url
+   * @param {any} body
+   */
   post(url, body) {
     return fetch(url, {
       method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json", ...this.headers },
     });
   }
 
-  /** @param {"info"|"warning"|"error"} level @param {string} text */
+  /**
+   * @param {"info"|"warning"|"error"} level
+   * @param {string} text
+   */
   note(level, text) { this.emit("note", { level, text }); }
 }
 
-/** Words of an HTTP refusal. @param {Response} answer */
+/**
+ * Words of an HTTP refusal.
+ * @param {Response} answer
+ */
 export async function refusalWords(answer) {
   try {
     const { problem, remedy } = await answer.json();

@@ -6,9 +6,13 @@ import { h, numberField, setAttr } from "./dom.js";
 
 /** @typedef {import("./core.js").Core} Core */
 
+/** @type {Record<string, string>} */
 const NAMES = { R: "right", L: "left", A: "front", P: "back", S: "top", I: "bottom" };
 
-/** @param {Core} core @param {import("./overlay.js").Overlay} overlay */
+/**
+ * @param {Core} core
+ * @param {import("./overlay.js").Overlay} overlay
+ */
 export function cutPanel(core, overlay) {
   /** @type {any[]} */
   const rows = [0, 1, 2].map((axis) => {
@@ -31,7 +35,12 @@ export function cutPanel(core, overlay) {
     const el = h("section", {}, h("header", {}, title, note), pair, h("div", { class: "fields two" }, ends[0].field.el, ends[1].field.el));
     return { axis, title, note, ends, fill, el };
   });
-  /** @param {number} axis @param {0|1} side @param {number} x @param {boolean} moving */
+  /**
+   * @param {number} axis
+   * @param {0|1} side
+   * @param {number} x
+   * @param {boolean} moving
+   */
   const move = (axis, side, x, moving) =>
     core.change({ crop: cropWith(core.state.crop, axis, side, x, core.volume.box) }, `crop${axis}${side}`, moving);
   const show = h("input", { type: "checkbox", checked: true, onchange: () => overlay.setBox(show.checked) });

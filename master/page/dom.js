@@ -3,19 +3,31 @@
 /**
  * Makes an element. Properties that begin with `on` are listeners; `text` is its text, others are
  * attributes (true: present; false, null or undefined: absent).
- * @param {string} tag @param {Record<string, any>} [props] @param {...(Node|string|null|undefined|false)} children
+ * @param {string} tag
+ * @param {Record<string, any>} [props]
+ * @param {...(Node|string|null|undefined|false)} children
  * @returns {any}
  */
 export function h(tag, props = {}, ...children) {
   return filled(document.createElement(tag), props, children);
 }
 
-/** As `h`, in SVG. @param {string} tag @param {Record<string, any>} [props] @param {...Node} children @returns {any} */
+/**
+ * As `h`, in SVG.
+ * @param {string} tag
+ * @param {Record<string, any>} [props]
+ * @param {...Node} children
+ * @returns {any}
+ */
 export function svg(tag, props = {}, ...children) {
   return filled(document.createElementNS("http://www.w3.org/2000/svg", tag), props, children);
 }
 
-/** @param {any} el @param {Record<string, any>} props @param {any[]} children */
+/**
+ * @param {any} el
+ * @param {Record<string, any>} props
+ * @param {any[]} children
+ */
 function filled(el, props, children) {
   for (const [name, value] of Object.entries(props)) {
     if (name.startsWith("on")) el.addEventListener(name.slice(2), value);
@@ -27,19 +39,33 @@ function filled(el, props, children) {
   return el;
 }
 
-/** @param {string} id @returns {any} */
+/**
+ * @param {string} id
+ * @returns {any}
+ */
 export const byId = (id) => document.getElementById(id);
 
-/** An icon of index.html. @param {string} name */
+/**
+ * An icon of index.html.
+ * @param {string} name
+ */
 export const icon = (name) =>
   svg("svg", { class: "icon", "aria-hidden": "true" }, svg("use", { href: `#i-${name}` }));
 
-/** Sets text only where it changed, so that screen readers stay quiet. @param {any} el @param {string} text */
+/**
+ * Sets text only where it changed, so that screen readers stay quiet.
+ * @param {any} el
+ * @param {string} text
+ */
 export function setText(el, text) {
   if (el.textContent !== text) el.textContent = text;
 }
 
-/** @param {Element} el @param {string} name @param {string|number|boolean|null} value */
+/**
+ * @param {Element} el
+ * @param {string} name
+ * @param {string|number|boolean|null} value
+ */
 export function setAttr(el, name, value) {
   if (value === null || value === false) el.removeAttribute(name);
   else if (el.getAttribute(name) !== String(value)) el.setAttribute(name, value === true ? "" : String(value));
@@ -49,7 +75,11 @@ let lastId = 0;
 /** @param {string} prefix */
 export const freshId = (prefix) => `${prefix}-${++lastId}`;
 
-/** Writes a number with at most `digits` significant digits. @param {number} x @param {number} [digits] */
+/**
+ * Writes a number with at most `digits` significant digits.
+ * @param {number} x
+ * @param {number} [digits]
+ */
 export const numberWords = (x, digits = 6) => String(Number(x.toPrecision(digits)));
 
 /**
@@ -95,7 +125,8 @@ export function numberField({ label, unit = "", min, max, step = 1, hidden = fal
 
 /**
  * Buttons of which one is pressed.
- * @param {string} label @param {[string, string][]} choices  value and text
+ * @param {string} label
+ * @param {[string, string][]} choices  value and text
  * @param {(value: string) => void} onchange
  */
 export function segments(label, choices, onchange) {
@@ -111,7 +142,11 @@ export function segments(label, choices, onchange) {
   };
 }
 
-/** @param {string} label @param {[string, string][]} choices @param {(value: string) => void} onchange */
+/**
+ * @param {string} label
+ * @param {[string, string][]} choices
+ * @param {(value: string) => void} onchange
+ */
 export function choice(label, choices, onchange) {
   const select = h("select", { onchange: () => onchange(select.value) },
     ...choices.map(([value, text]) => h("option", { value, text })));
@@ -119,7 +154,11 @@ export function choice(label, choices, onchange) {
   return { el, select, set: (/** @type {string} */ value) => { select.value = value; } };
 }
 
-/** Gives a file to the browser to keep. @param {Blob} blob @param {string} name */
+/**
+ * Gives a file to the browser to keep.
+ * @param {Blob} blob
+ * @param {string} name
+ */
 export function download(blob, name) {
   const url = URL.createObjectURL(blob);
   const a = h("a", { href: url, download: name });
@@ -129,11 +168,17 @@ export function download(blob, name) {
   setTimeout(() => URL.revokeObjectURL(url), 60_000);
 }
 
-/** @param {any} json @param {string} name */
+/**
+ * @param {any} json
+ * @param {string} name
+ */
 export const downloadJson = (json, name) =>
   download(new Blob([JSON.stringify(json, null, 1)], { type: "application/json" }), name);
 
-/** Copies text; says whether it could. @param {string} text */
+/**
+ * Copies text; says whether it could.
+ * @param {string} text
+ */
 export async function copyText(text) {
   try {
     await navigator.clipboard.writeText(text);

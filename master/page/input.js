@@ -14,14 +14,21 @@ import { fadedBy, windowOf, withWindow } from "./tf.js";
 /** A press that moved less than this many pixels is a click. */
 const CLICK_PX = 4;
 
-/** Heights in mm that can be shown. @param {import("./types.js").Volume} volume @returns {[number, number]} */
+/**
+ * Heights in mm that can be shown.
+ * @param {import("./types.js").Volume} volume
+ * @returns {[number, number]}
+ */
 export function heightLimits(volume) {
   const vox = Math.min(...volume.steps.map((s) => Math.hypot(...s)));
   const extent = Math.max(...[0, 1, 2].map((a) => volume.box[1][a] - volume.box[0][a]));
   return [2 * vox, 20 * extent];
 }
 
-/** @param {any} stage @param {Core} core */
+/**
+ * @param {any} stage
+ * @param {Core} core
+ */
 export function listenToHands(stage, core) {
   /** @type {Map<number, {x: number, y: number}>} */
   const fingers = new Map();
@@ -30,13 +37,21 @@ export function listenToHands(stage, core) {
   let lastTap = { at: 0, x: 0, y: 0 };
 
   const box = () => stage.getBoundingClientRect();
-  /** @param {number} x @param {number} y  of the client, to picture pixels */
+  /**
+   * @param {number} x
+   * @param {number} y  of the client, to picture pixels
+   */
   const inPicture = (x, y) => {
     const b = box();
     return [((x - b.left) / b.width) * core.size[0], ((y - b.top) / b.height) * core.size[1]];
   };
   const ready = () => core.volume && !core.opening;
-  /** @param {number} factor @param {number} x @param {number} y @param {any} cam */
+  /**
+   * @param {number} factor
+   * @param {number} x
+   * @param {number} y
+   * @param {any} cam
+   */
   const zoom = (factor, x, y, cam) => {
     const b = box();
     return zoomedAt(cam, core.axes, factor, x - b.left - b.width / 2, y - b.top - b.height / 2, b.height,
@@ -145,7 +160,10 @@ export function listenToHands(stage, core) {
 }
 
 /**
- * Asks which values made a pixel. @param {Core} core @param {number} x @param {number} y
+ * Asks which values made a pixel.
+ * @param {Core} core
+ * @param {number} x
+ * @param {number} y
  * @param {boolean} aim  make what is there the target
  */
 export function pickAt(core, x, y, aim) {
@@ -153,7 +171,11 @@ export function pickAt(core, x, y, aim) {
   core.emit("picking", { id, x, y, aim });
 }
 
-/** Looks at the point of an answer. @param {Core} core @param {any} picked */
+/**
+ * Looks at the point of an answer.
+ * @param {Core} core
+ * @param {any} picked
+ */
 export function aimAtPicked(core, picked) {
   if (!picked.hit) {
     core.note("info", "Nothing can be seen there, so the target stays.");

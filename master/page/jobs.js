@@ -12,7 +12,11 @@ const STATES = {
 };
 const OPEN = ["queued", "preparing", "waiting", "running"];
 
-/** What a job does, in a few words. @param {any} job @param {number} now */
+/**
+ * What a job does, in a few words.
+ * @param {any} job
+ * @param {number} now
+ */
 export function jobWords(job, now) {
   if (job.state === "running" && job.left_ms != null) return `${durationWords(job.left_ms)} left`;
   if (OPEN.includes(job.state)) return job.waits_for || job.message || `for ${durationWords(now - job.submitted_ms)}`;
@@ -20,7 +24,10 @@ export function jobWords(job, now) {
   return job.finished_ms ? `${durationWords(now - job.finished_ms)} ago` : "";
 }
 
-/** @param {Core} core @param {(text: string) => void} announce */
+/**
+ * @param {Core} core
+ * @param {(text: string) => void} announce
+ */
 export function jobsPanel(core, announce) {
   /** @type {Map<string, any>} */
   const known = new Map();

@@ -66,14 +66,21 @@ export function listenToKeys(core, acts) {
   });
 }
 
-/** @param {Record<string, () => void>} acts @param {KeyboardEvent} e */
+/**
+ * @param {Record<string, () => void>} acts
+ * @param {KeyboardEvent} e
+ */
 function run(acts, e) {
   const act = acts[e.key === " " ? "Space" : e.key === "?" ? "?" : e.key.toLowerCase() + (e.shiftKey ? "+shift" : "")];
   act?.();
   return !!act;
 }
 
-/** @param {Core} core @param {KeyboardEvent} e @returns {boolean} */
+/**
+ * @param {Core} core
+ * @param {KeyboardEvent} e
+ * @returns {boolean}
+ */
 function cameraKey(core, e) {
   const { cam } = core.state;
   const o = core.axes;

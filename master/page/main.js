@@ -43,7 +43,11 @@ let open = "";
 
 for (const [name, panel] of Object.entries(panels)) byId(`panel-${name}`).append(panel.el);
 
-/** Opens a panel; the open one again closes it, if `toggle`. @param {string} name @param {boolean} toggle */
+/**
+ * Opens a panel; the open one again closes it, if `toggle`.
+ * @param {string} name
+ * @param {boolean} toggle
+ */
 function openTab(name, toggle = true) {
   const next = toggle && name === open ? "" : name;
   if (next === open) return;
@@ -193,7 +197,11 @@ addEventListener("drop", async (e) => {
   panels.volumes.begin(files);
 });
 
-/** Files of a drop, those in folders too. @param {any} transfer @returns {Promise<File[]>} */
+/**
+ * Files of a drop, those in folders too.
+ * @param {any} transfer
+ * @returns {Promise<File[]>}
+ */
 async function filesOf(transfer) {
   const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
   if (!entries.length) return [...transfer.files];

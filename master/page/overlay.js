@@ -16,7 +16,11 @@ import { setAttr, svg } from "./dom.js";
 const CUBE = 30;
 
 export class Overlay {
-  /** @param {any} root  an svg element over the stage @param {any} stage @param {Core} core */
+  /**
+   * @param {any} root  an svg element over the stage
+   * @param {any} stage
+   * @param {Core} core
+   */
   constructor(root, stage, core) {
     this.root = root;
     this.stage = stage;
@@ -40,7 +44,10 @@ export class Overlay {
     new ResizeObserver(() => this.draw()).observe(stage);
   }
 
-  /** @param {number} axis @param {0|1} side */
+  /**
+   * @param {number} axis
+   * @param {0|1} side
+   */
   face(axis, side) {
     const el = svg("g", { class: "face", "data-handle": "" },
       svg("circle", { r: 16, class: "hit" }), svg("rect", { x: -5, y: -5, width: 10, height: 10, rx: 2 }));
@@ -87,7 +94,10 @@ export class Overlay {
     this.draw();
   }
 
-  /** Marks a pixel of the picture, or none. @param {{x: number, y: number}|null} at */
+  /**
+   * Marks a pixel of the picture, or none.
+   * @param {{x: number, y: number}|null} at
+   */
   setMark(at) {
     this.mark = at;
     this.draw();
@@ -119,7 +129,10 @@ export class Overlay {
     }
   }
 
-  /** @param {number} width @param {number} height */
+  /**
+   * @param {number} width
+   * @param {number} height
+   */
   drawBar(width, height) {
     const { state, volume } = this.core;
     const { mm, px } = scaleBar(state.cam.height / height, Math.min(160, width / 4));
@@ -166,7 +179,10 @@ export class Overlay {
     this.cube.replaceChildren(...shown);
   }
 
-  /** Looks at the face of the cube with normal n. @param {Vec3} n */
+  /**
+   * Looks at the face of the cube with normal n.
+   * @param {Vec3} n
+   */
   turnTo(n) {
     const { core } = this;
     const side = SIDES.find((name) => {
@@ -185,7 +201,10 @@ export class Overlay {
     const project = this.project();
     const { ahead } = eyeAxes(state.cam, axes);
     const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((c) => project(boxCorner(ends, c)));
-    /** Both faces beside the edge turn away from the eye. @param {number[]} edge */
+    /**
+     * Both faces beside the edge turn away from the eye.
+     * @param {number[]} edge
+     */
     const hidden = ([a, b]) => [0, 1, 2].every((axis) =>
       (a ^ b) === 1 << axis || (((a >> axis) & 1) ? ahead[axis] > 0 : ahead[axis] < 0));
     const path = (/** @type {number[][]} */ edges) => edges.map(([a, b]) => {
@@ -211,12 +230,20 @@ export function lightness(hex) {
   return 0.3 * r + 0.59 * g + 0.11 * b;
 }
 
-/** Turns the eye to a side of the body. @param {Core} core @param {string} side */
+/**
+ * Turns the eye to a side of the body.
+ * @param {Core} core
+ * @param {string} side
+ */
 export function lookFrom(core, side) {
   const [azimuth, elevation] = sideAngles(side, core.axes);
   core.change({ cam: { ...core.state.cam, azimuth, elevation, roll: 0 } }, "");
 }
 
-/** Words for a side of this volume. @param {Core} core @param {string} side */
+/**
+ * Words for a side of this volume.
+ * @param {Core} core
+ * @param {string} side
+ */
 export const sideWords = (core, side) =>
   core.volume?.anatomical === false ? sidePlain(side) : side;

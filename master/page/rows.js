@@ -73,7 +73,9 @@ export class Rows {
 
 /**
  * A list that the master keeps up to date by deltas: {reset, changed, removed}.
- * @param {Map<string, any>} known @param {any} message @param {string} id  name of the entries' id
+ * @param {Map<string, any>} known
+ * @param {any} message
+ * @param {string} id  name of the entries' id
  */
 export function applyDelta(known, message, id) {
   if (message.reset) known.clear();

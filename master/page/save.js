@@ -9,10 +9,20 @@ import { camWords } from "./camera.js";
 
 /** @typedef {import("./core.js").Core} Core */
 
-/** Name for files of a volume. @param {Core} core @param {string} end */
+/**
+ * Name for files of a volume.
+ * @param {Core} core
+ * @param {string} end
+ */
 const fileName = (core, end) => `${core.state.volume.replace(/\.(nii|nrrd|mha|mhd|gz|raw)+$/g, "").replace(/[^\w.-]+/g, "_")}${end}`;
 
-/** Saves the picture as `slabcast render` writes it, with its record inside. @param {Core} core @param {[number, number]} size @param {string} format @param {boolean} transparent */
+/**
+ * Saves the picture as `slabcast render` writes it, with its record inside.
+ * @param {Core} core
+ * @param {[number, number]} size
+ * @param {string} format
+ * @param {boolean} transparent
+ */
 export async function savePicture(core, size, format, transparent) {
   const doc = { ...documentOf(core.state, core.volume, size), format };
   if (transparent) doc.background = "transparent";
@@ -158,7 +168,10 @@ export function savePanel(core) {
   return { el, shown: draw };
 }
 
-/** Copies the page's address with the present state. @param {Core} core */
+/**
+ * Copies the page's address with the present state.
+ * @param {Core} core
+ */
 export async function copyAddress(core) {
   const hash = await core.address();
   if (hash === null) return;

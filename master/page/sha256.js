@@ -16,7 +16,10 @@ const fraction = (x) => ((x - Math.floor(x)) * 2 ** 32) | 0;
 const ROUND_WORDS = PRIMES.map((p) => fraction(Math.cbrt(p)));
 const START_WORDS = PRIMES.slice(0, 8).map((p) => fraction(Math.sqrt(p)));
 
-/** @param {Uint8Array|Uint8ClampedArray} bytes @returns {string} */
+/**
+ * @param {Uint8Array|Uint8ClampedArray} bytes
+ * @returns {string}
+ */
 export function sha256Plain(bytes) {
   const blocks = (bytes.length + 72) >> 6;
   const tail = new Uint8Array(128);
@@ -53,7 +56,10 @@ export function sha256Plain(bytes) {
   return [...state].map((x) => (x >>> 0).toString(16).padStart(8, "0")).join("");
 }
 
-/** @param {Uint8Array|Uint8ClampedArray} bytes @returns {Promise<string>} */
+/**
+ * @param {Uint8Array|Uint8ClampedArray} bytes
+ * @returns {Promise<string>}
+ */
 export async function sha256(bytes) {
   if (!globalThis.crypto?.subtle) return sha256Plain(bytes);
   const digest = new Uint8Array(await crypto.subtle.digest("SHA-256", bytes));

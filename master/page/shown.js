@@ -10,13 +10,19 @@ const SOURCES = {
   rounding: "places on the grid", truncation: "kernel's end", thickness: "thickness of sheets", ripple: "ripple of the kernel",
 };
 
-/** Largest error of all sources, in 1/255, or null. @param {any} error */
+/**
+ * Largest error of all sources, in 1/255, or null.
+ * @param {any} error
+ */
 export function largestError(error) {
   const values = Object.values(error ?? {}).filter((e) => e && Number.isFinite(/** @type {any} */ (e).value));
   return values.length ? Math.max(...values.map((e) => /** @type {any} */ (e).value)) : null;
 }
 
-/** @param {Core} core @param {any} strip */
+/**
+ * @param {Core} core
+ * @param {any} strip
+ */
 export function shownPanel(core, strip) {
   const part = (/** @type {string} */ name) => strip.querySelector(`[data-part="${name}"]`);
   const parts = Object.fromEntries(["state", "ms", "level", "error", "hash"].map((n) => [n, part(n)]));

@@ -12,10 +12,19 @@ import { plainTf, tfProblem } from "./tf.js";
 /** @typedef {import("./types.js").Volume} Volume */
 /** @typedef {import("./types.js").Cam} Cam */
 
+/**
+ * Streams that deflate and inflate, which older type libraries do not know.
+ * @type {any}
+ */
+const Streams = globalThis;
+
 /** Longest address that is written in full; programs cut longer ones. */
 export const LONGEST_ADDRESS = 1900;
 
-/** @param {{up: string|null, front: string|null}} state @param {Volume} volume */
+/**
+ * @param {{up: string|null, front: string|null}} state
+ * @param {Volume} volume
+ */
 export function axesOfState(state, volume) {
   const up = state.up ?? volume.up;
   const front = state.front ?? (state.up && state.up !== volume.up ? (up.endsWith("z") ? "+y" : "+z") : volume.front);
@@ -26,7 +35,11 @@ export function axesOfState(state, volume) {
 export const newFilm = () =>
   ({ kind: "turn", degrees: 360, seconds: 6, fps: 30, format: "mp4", keys: [] });
 
-/** The first picture of a volume. @param {Volume} volume @returns {State} */
+/**
+ * The first picture of a volume.
+ * @param {Volume} volume
+ * @returns {State}
+ */
 export function homeState(volume) {
   const o = axesOf(volume.up, volume.front);
   /** @type {Cam} */
@@ -42,24 +55,35 @@ export function homeState(volume) {
   };
 }
 
-/** What `tf` is in files and messages: a preset's name while nobody changed it. @param {State} state */
+/**
+ * What `tf` is in files and messages: a preset's name while nobody changed it.
+ * @param {State} state
+ */
 export const tfChoice = (state) => state.preset ?? state.tf;
 
 /**
  * The view path of one still.
- * @param {State} state @param {Volume} volume @param {[number, number]} size
+ * @param {State} state
+ * @param {Volume} volume
+ * @param {[number, number]} size
  */
 export function stillPath(state, volume, size) {
   const key = keyOfCam(state.cam, axesOfState(state, volume));
   return pathWith(state, { version: 1, size, keyframes: { frames: 1, ...standing(state), keys: [key] } });
 }
 
-/** Axes other than the volume's, as paths have them. @param {State} state */
+/**
+ * Axes other than the volume's, as paths have them.
+ * @param {State} state
+ */
 function standing(state) {
   return { ...(state.up && { up: state.up }), ...(state.front && { front: state.front }) };
 }
 
-/** @param {State} state @param {any} path */
+/**
+ * @param {State} state
+ * @param {any} path
+ */
 function pathWith(state, path) {
   const crop = cropJson(state.crop);
   return crop ? { ...path, crop } : path;
@@ -67,7 +91,9 @@ function pathWith(state, path) {
 
 /**
  * The view path of a movie: a turn from the present view on, or key frames.
- * @param {State} state @param {Volume} volume @param {[number, number]} size
+ * @param {State} state
+ * @param {Volume} volume
+ * @param {[number, number]} size
  */
 export function filmPath(state, volume, size) {
   const { film, cam } = state;
@@ -86,7 +112,9 @@ export function filmPath(state, volume, size) {
 }
 
 /**
- * @param {State} state @param {Volume} volume @param {[number, number]} size
+ * @param {State} state
+ * @param {Volume} volume
+ * @param {[number, number]} size
  * @returns {any} the scene document of a still
  */
 export function documentOf(state, volume, size) {
@@ -102,7 +130,9 @@ export function documentOf(state, volume, size) {
 
 /**
  * Returns the state of a document; what it leaves out is as at home. Refuses with a sentence.
- * @param {any} doc @param {Volume} volume @returns {State}
+ * @param {any} doc
+ * @param {Volume} volume
+ * @returns {State}
  */
 export function stateOfDocument(doc, volume) {
   if (doc?.version !== 1) throw new Error("The address is of another version of slabcast.");
@@ -140,22 +170,31 @@ export function bytesOfBase64url(text) {
   return Uint8Array.from(plain, (c) => c.charCodeAt(0));
 }
 
-/** @param {Uint8Array} bytes @param {any} through */
+/**
+ * @param {Uint8Array} bytes
+ * @param {any} through
+ */
 async function piped(bytes, through) {
   const stream = new Blob([bytes]).stream().pipeThrough(through);
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** Writes a document as an address's fragment. @param {any} doc */
+/**
+ * Writes a document as an address's fragment.
+ * @param {any} doc
+ */
 export async function fragmentOf(doc) {
   const bytes = new TextEncoder().encode(JSON.stringify(doc));
-  return `#v1,${base64url(await piped(bytes, new CompressionStream("deflate-raw")))}`;
+  return `#v1,${base64url(await piped(bytes, new Streams.CompressionStream("deflate-raw")))}`;
 }
 
-/** Reads a fragment; null if it holds no document. @param {string} hash */
+/**
+ * Reads a fragment; null if it holds no document.
+ * @param {string} hash
+ */
 export async function documentOfFragment(hash) {
   if (!hash.startsWith("#v1,")) return null;
-  const bytes = await piped(bytesOfBase64url(hash.slice(4)), new DecompressionStream("deflate-raw"));
+  const bytes = await piped(bytesOfBase64url(hash.slice(4)), new Streams.DecompressionStream("deflate-raw"));
   return JSON.parse(new TextDecoder().decode(bytes));
 }
 
@@ -173,7 +212,11 @@ export class Steps {
 
   get now() { return this.past[this.past.length - 1]; }
 
-  /** @param {State} state @param {string} tag @param {number} at  milliseconds */
+  /**
+   * @param {State} state
+   * @param {string} tag
+   * @param {number} at  milliseconds
+   */
   push(state, tag, at) {
     const merge = tag !== "" && tag === this.tag && at - this.at < 1000 && this.past.length > 1;
     if (merge) this.past[this.past.length - 1] = state;

@@ -82,7 +82,10 @@ export class TfView {
   /** @param {number} a opacity */
   py(a) { return this.bottom - heightOf(a, this.stretched) * this.plotHeight; }
 
-  /** Value and opacity at a place of the screen. @param {{clientX: number, clientY: number}} e */
+  /**
+   * Value and opacity at a place of the screen.
+   * @param {{clientX: number, clientY: number}} e
+   */
   at(e) {
     const b = this.el.getBoundingClientRect();
     const [u, v] = [(e.clientX - b.left) * (this.width / b.width), (e.clientY - b.top) * (EDGE.height / b.height)];
@@ -96,10 +99,17 @@ export class TfView {
   get range() { return /** @type {import("./types.js").Volume} */ (this.core.volume).range; }
   get tf() { return this.core.state.tf; }
 
-  /** @param {import("./types.js").Tf} tf @param {string} tag @param {boolean} moving */
+  /**
+   * @param {import("./types.js").Tf} tf
+   * @param {string} tag
+   * @param {boolean} moving
+   */
   put(tf, tag, moving) { this.core.change({ tf }, tag, moving); }
 
-  /** @param {"point"|"stop"} kind @param {number} index */
+  /**
+   * @param {"point"|"stop"} kind
+   * @param {number} index
+   */
   select(kind, index) {
     this.selected = { kind, index };
     this.onselect(this.selected);
@@ -196,7 +206,10 @@ export class TfView {
     if (target?.dataset.kind === "stop") this.remove("stop", Number(target.dataset.index));
   }
 
-  /** @param {"point"|"stop"} kind @param {number} index */
+  /**
+   * @param {"point"|"stop"} kind
+   * @param {number} index
+   */
   remove(kind, index) {
     this.put(kind === "point" ? withoutPoint(this.tf, index) : withoutStop(this.tf, index), "", false);
     this.select(kind, Math.max(0, index - 1));
@@ -231,7 +244,10 @@ export class TfView {
     e.stopPropagation();
   }
 
-  /** Ranges that made a picked pixel. @param {{from: number, to: number, share: number}[]} ranges */
+  /**
+   * Ranges that made a picked pixel.
+   * @param {{from: number, to: number, share: number}[]} ranges
+   */
   showPicked(ranges) {
     this.pickedRanges = ranges;
     this.draw();

@@ -17,17 +17,25 @@ export const linearOf = (c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055)
 /** @param {number} c  linear light, 0 to 1 */
 export const srgbOf = (c) => (c <= 0.0031308 ? c * 12.92 : 1.055 * c ** (1 / 2.4) - 0.055);
 
-/** @param {number[]} rgb  0 to 1 @returns {string} #rrggbb */
+/**
+ * @param {number[]} rgb  0 to 1
+ * @returns {string} #rrggbb
+ */
 export const hexOf = (rgb) =>
   "#" + rgb.map((c) => Math.round(clamp(c, 0, 1) * 255).toString(16).padStart(2, "0")).join("");
-/** @param {string} hex #rrggbb @returns {number[]} 0 to 1 */
+/**
+ * @param {string} hex #rrggbb
+ * @returns {number[]} 0 to 1
+ */
 export const rgbOf = (hex) =>
   [1, 3, 5].map((i) => significant(parseInt(hex.slice(i, i + 2), 16) / 255, 4));
 
 /**
  * Value at x of the broken line through points [x, ...]; outside clamped; of two points at one x the
  * later one holds.
- * @param {number[][]} points @param {number} x @returns {number[]}
+ * @param {number[][]} points
+ * @param {number} x
+ * @returns {number[]}
  */
 export function lineAt(points, x) {
   let after = 0;
@@ -40,10 +48,19 @@ export function lineAt(points, x) {
   return a.map((v, i) => v * (1 - t) + b[i] * t);
 }
 
-/** Opacity at a value. @param {Tf} tf @param {number} x */
+/**
+ * Opacity at a value.
+ * @param {Tf} tf
+ * @param {number} x
+ */
 export const opacityAt = (tf, x) => lineAt(tf.opacities, x)[1];
 
-/** Colour at a value as sRGB; between points it changes in linear light. @param {Tf} tf @param {number} x @returns {number[]} */
+/**
+ * Colour at a value as sRGB; between points it changes in linear light.
+ * @param {Tf} tf
+ * @param {number} x
+ * @returns {number[]}
+ */
 export function colorAt(tf, x) {
   if (tf.color_space === "linear") return lineAt(tf.colors, x).slice(1).map(srgbOf);
   const linear = tf.colors.map(([at, ...rgb]) => [at, ...rgb.map(linearOf)]);
@@ -52,7 +69,9 @@ export function colorAt(tf, x) {
 
 /**
  * Returns the transfer function over values and with every field written out.
- * @param {any} tf @param {[number, number]} range  smallest and largest value @returns {Tf}
+ * @param {any} tf
+ * @param {[number, number]} range  smallest and largest value
+ * @returns {Tf}
  */
 export function plainTf(tf, range) {
   const [lo, hi] = range;
@@ -73,7 +92,11 @@ export function plainTf(tf, range) {
   return plain;
 }
 
-/** Says what is wrong with numbers from outside, or null. @param {any} tf @returns {string|null} */
+/**
+ * Says what is wrong with numbers from outside, or null.
+ * @param {any} tf
+ * @returns {string|null}
+ */
 export function tfProblem(tf) {
   if (typeof tf !== "object" || !tf) return "is no transfer function";
   if (tf.version !== 1) return "has no \"version\": 1";
@@ -93,9 +116,15 @@ export function tfProblem(tf) {
   return null;
 }
 
-/** Step to which values are rounded: 1/2000 of the range, as a power of ten. @param {[number, number]} range */
+/**
+ * Step to which values are rounded: 1/2000 of the range, as a power of ten.
+ * @param {[number, number]} range
+ */
 const valueStep = ([lo, hi]) => 10 ** Math.floor(Math.log10((hi - lo) / 1000 || 1));
-/** @param {number} x @param {[number, number]} range */
+/**
+ * @param {number} x
+ * @param {[number, number]} range
+ */
 export const roundValue = (x, range) => {
   const step = valueStep(range);
   return Number((Math.round(x / step) * step).toPrecision(9));
@@ -105,7 +134,10 @@ const roundOpacity = (a) => Number(clamp(a, 0, 1).toPrecision(3));
 
 /**
  * Puts an opacity point. Returns the function and the point's index.
- * @param {Tf} tf @param {number} x @param {number} a @param {[number, number]} range
+ * @param {Tf} tf
+ * @param {number} x
+ * @param {number} a
+ * @param {[number, number]} range
  * @returns {[Tf, number]}
  */
 export function withPoint(tf, x, a, range) {
@@ -116,7 +148,15 @@ export function withPoint(tf, x, a, range) {
   return [{ ...tf, opacities }, index];
 }
 
-/** Moves an opacity point; it can't pass its neighbours. @param {Tf} tf @param {number} i @param {number} x @param {number} a @param {[number, number]} range @returns {Tf} */
+/**
+ * Moves an opacity point; it can't pass its neighbours.
+ * @param {Tf} tf
+ * @param {number} i
+ * @param {number} x
+ * @param {number} a
+ * @param {[number, number]} range
+ * @returns {Tf}
+ */
 export function movedPoint(tf, i, x, a, range) {
   const points = tf.opacities;
   const lo = points[i - 1]?.[0] ?? range[0];
@@ -126,13 +166,24 @@ export function movedPoint(tf, i, x, a, range) {
   return { ...tf, opacities };
 }
 
-/** Takes an opacity point away; the last two stay. @param {Tf} tf @param {number} i @returns {Tf} */
+/**
+ * Takes an opacity point away; the last two stay.
+ * @param {Tf} tf
+ * @param {number} i
+ * @returns {Tf}
+ */
 export function withoutPoint(tf, i) {
   if (tf.opacities.length <= 2) return tf;
   return { ...tf, opacities: tf.opacities.filter((_, k) => k !== i) };
 }
 
-/** Puts a colour stop of the colour that is there. @param {Tf} tf @param {number} x @param {[number, number]} range @returns {[Tf, number]} */
+/**
+ * Puts a colour stop of the colour that is there.
+ * @param {Tf} tf
+ * @param {number} x
+ * @param {[number, number]} range
+ * @returns {[Tf, number]}
+ */
 export function withStop(tf, x, range) {
   const at = roundValue(clamp(x, ...range), range);
   const index = tf.colors.filter((p) => p[0] <= at).length;
@@ -143,7 +194,14 @@ export function withStop(tf, x, range) {
   return [{ ...tf, colors }, index];
 }
 
-/** Changes a colour stop's value or colour (#rrggbb). @param {Tf} tf @param {number} i @param {{x?: number, hex?: string}} to @param {[number, number]} range @returns {Tf} */
+/**
+ * Changes a colour stop's value or colour (#rrggbb).
+ * @param {Tf} tf
+ * @param {number} i
+ * @param {{x?: number, hex?: string}} to
+ * @param {[number, number]} range
+ * @returns {Tf}
+ */
 export function changedStop(tf, i, to, range) {
   const colors = tf.colors.slice();
   const [x0, ...rgb0] = colors[i];
@@ -156,18 +214,28 @@ export function changedStop(tf, i, to, range) {
   return { ...tf, colors };
 }
 
-/** Colour of a stop as #rrggbb. @param {Tf} tf @param {number} i */
+/**
+ * Colour of a stop as #rrggbb.
+ * @param {Tf} tf
+ * @param {number} i
+ */
 export const stopHex = (tf, i) =>
   hexOf(tf.color_space === "linear" ? tf.colors[i].slice(1).map(srgbOf) : tf.colors[i].slice(1));
 
-/** Takes a colour stop away; the last one stays. @param {Tf} tf @param {number} i @returns {Tf} */
+/**
+ * Takes a colour stop away; the last one stays.
+ * @param {Tf} tf
+ * @param {number} i
+ * @returns {Tf}
+ */
 export const withoutStop = (tf, i) =>
   tf.colors.length <= 1 ? tf : { ...tf, colors: tf.colors.filter((_, k) => k !== i) };
 
 /**
  * The window: from the last value that is invisible before what is shown to the first that is as
  * opaque as it gets.
- * @param {Tf} tf @returns {[number, number]}
+ * @param {Tf} tf
+ * @returns {[number, number]}
  */
 export function windowOf(tf) {
   const points = tf.opacities;
@@ -181,7 +249,10 @@ export function windowOf(tf) {
 /**
  * Moves the window to [lo, hi]: all points follow, colours too, but for those at the ends of the
  * range.
- * @param {Tf} tf @param {[number, number]} to @param {[number, number]} range @returns {Tf}
+ * @param {Tf} tf
+ * @param {[number, number]} to
+ * @param {[number, number]} range
+ * @returns {Tf}
  */
 export function withWindow(tf, to, range) {
   const [a, b] = windowOf(tf);
@@ -199,7 +270,12 @@ export function withWindow(tf, to, range) {
   return { ...tf, opacities, colors };
 }
 
-/** Makes all of it more or less opaque. @param {Tf} tf @param {number} factor @returns {Tf} */
+/**
+ * Makes all of it more or less opaque.
+ * @param {Tf} tf
+ * @param {number} factor
+ * @returns {Tf}
+ */
 export function fadedBy(tf, factor) {
   return { ...tf, opacities: tf.opacities.map(([x, a]) => [x, roundOpacity(a * factor)]) };
 }
@@ -207,13 +283,20 @@ export function fadedBy(tf, factor) {
 /**
  * Shows more (factor above 1) or less of the values between two: their opacities change, with a ramp
  * of an eighth of the width to each side, and nothing else does.
- * @param {Tf} tf @param {number} from @param {number} to @param {number} factor
- * @param {[number, number]} range @returns {Tf}
+ * @param {Tf} tf
+ * @param {number} from
+ * @param {number} to
+ * @param {number} factor
+ * @param {[number, number]} range
+ * @returns {Tf}
  */
 export function emphasised(tf, from, to, factor, range) {
   const ramp = Math.max((to - from) / 8, valueStep(range));
   const [a, b] = [Math.max(from - ramp, range[0]), Math.min(to + ramp, range[1])];
-  /** Opacity after the change. @param {number} x */
+  /**
+   * Opacity after the change.
+   * @param {number} x
+   */
   const after = (x) => {
     const was = opacityAt(tf, x);
     if (factor <= 1) return was * factor;
@@ -230,17 +313,32 @@ export function emphasised(tf, from, to, factor, range) {
   return { ...tf, opacities: sorted.filter((p, i) => i === 0 || p.join() !== sorted[i - 1].join()) };
 }
 
-/** Changes light. @param {Tf} tf @param {object} patch @returns {Tf} */
+/**
+ * Changes light.
+ * @param {Tf} tf
+ * @param {object} patch
+ * @returns {Tf}
+ */
 export const withLight = (tf, patch) => ({ ...tf, shading: { ...LIGHT, ...tf.shading, ...patch } });
 
-/** Height of an opacity on the editor's axis, 0 to 1: the lowest tenth takes two fifths. @param {number} a @param {boolean} stretched */
+/**
+ * Height of an opacity on the editor's axis, 0 to 1: the lowest tenth takes two fifths.
+ * @param {number} a
+ * @param {boolean} stretched
+ */
 export const heightOf = (a, stretched) => (stretched ? clamp(a, 0, 1) ** 0.4 : clamp(a, 0, 1));
-/** Opacity at a height of that axis. @param {number} y @param {boolean} stretched */
+/**
+ * Opacity at a height of that axis.
+ * @param {number} y
+ * @param {boolean} stretched
+ */
 export const opacityOf = (y, stretched) => (stretched ? clamp(y, 0, 1) ** 2.5 : clamp(y, 0, 1));
 
 /**
  * Heights of a histogram's bars, 0 to 1.
- * @param {number[]} counts @param {boolean} log @returns {number[]}
+ * @param {number[]} counts
+ * @param {boolean} log
+ * @returns {number[]}
  */
 export function barHeights(counts, log) {
   const f = log ? (/** @type {number} */ n) => Math.log1p(n) : (/** @type {number} */ n) => n;
@@ -253,13 +351,18 @@ export function barHeights(counts, log) {
 /**
  * Points between two colours such that lines in sRGB numbers, as ParaView draws them, stay within half
  * a step of 255 of our lines in linear light.
- * @param {Tf} tf @returns {number[][]} [x, r, g, b] in sRGB
+ * @param {Tf} tf
+ * @returns {number[][]} [x, r, g, b] in sRGB
  */
 function srgbStops(tf) {
   const out = tf.colors.map(([x]) => x);
   /** @type {number[][]} */
   const stops = [];
-  /** @param {number} a @param {number} b @param {number} depth */
+  /**
+   * @param {number} a
+   * @param {number} b
+   * @param {number} depth
+   */
   const divide = (a, b, depth) => {
     const [p, q, m] = [colorAt(tf, a), colorAt(tf, b), colorAt(tf, (a + b) / 2)];
     if (depth < 6 && m.some((c, i) => Math.abs(c - (p[i] + q[i]) / 2) > 0.5 / 255)) {
@@ -274,7 +377,11 @@ function srgbStops(tf) {
   return stops;
 }
 
-/** Returns the function as ParaView imports colour maps. @param {Tf} tf @param {string} name */
+/**
+ * Returns the function as ParaView imports colour maps.
+ * @param {Tf} tf
+ * @param {string} name
+ */
 export function paraviewOf(tf, name) {
   return [{
     ColorSpace: "RGB",
@@ -288,7 +395,9 @@ export function paraviewOf(tf, name) {
 
 /**
  * Reads our JSON, or a ParaView colour map in RGB.
- * @param {string} text @param {[number, number]} range @returns {Tf}
+ * @param {string} text
+ * @param {[number, number]} range
+ * @returns {Tf}
  * @throws {Error} with a sentence that says what is wrong
  */
 export function readTf(text, range) {

@@ -7,7 +7,10 @@ import { lookFrom, sideWords } from "./overlay.js";
 
 /** @typedef {import("./core.js").Core} Core */
 
-/** Fits what can be seen to the picture. @param {Core} core */
+/**
+ * Fits what can be seen to the picture.
+ * @param {Core} core
+ */
 export function fitView(core) {
   const id = core.wire.ask({ type: "fit", camera: { azimuth: core.state.cam.azimuth, elevation: core.state.cam.elevation, projection: core.state.cam.projection, ...(core.state.cam.projection === "persp" && { fov: core.state.cam.fov }) } });
   core.emit("fitting", id);
@@ -88,7 +91,10 @@ export function viewPanel(core) {
   return { el };
 }
 
-/** @param {any} el @param {string} hex */
+/**
+ * @param {any} el
+ * @param {string} hex
+ */
 function rgbEqual(el, hex) {
   const numbers = (el.style.background.match(/\d+/g) ?? []).map(Number);
   return [1, 3, 5].every((i, k) => parseInt(hex.slice(i, i + 2), 16) === numbers[k]);

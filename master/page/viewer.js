@@ -38,7 +38,10 @@ class Pass {
 }
 
 export class Viewer {
-  /** @param {any} stage @param {import("./core.js").Core} core */
+  /**
+   * @param {any} stage
+   * @param {import("./core.js").Core} core
+   */
   constructor(stage, core) {
     this.stage = stage;
     this.core = core;
@@ -103,7 +106,10 @@ export class Viewer {
     this.advance(pass);
   }
 
-  /** Lets the still's tiles onto the screen. @param {Pass} pass */
+  /**
+   * Lets the still's tiles onto the screen.
+   * @param {Pass} pass
+   */
   show(pass) {
     pass.live = true;
     const { still, moving } = this;
@@ -153,7 +159,11 @@ export class Viewer {
     if (pass.still) this.hash(pass, message);
   }
 
-  /** Hashes what is on the canvas and compares it with what the master drew. @param {Pass} pass @param {any} message */
+  /**
+   * Hashes what is on the canvas and compares it with what the master drew.
+   * @param {Pass} pass
+   * @param {any} message
+   */
   async hash(pass, message) {
     const pixels = this.stillCtx.getImageData(0, 0, this.still.width, this.still.height).data;
     const hex = await sha256(pixels);

@@ -9,7 +9,10 @@ import { Rows, applyDelta } from "./rows.js";
 /** Tries of one chunk before an upload is given up. */
 const TRIES = 5;
 
-/** @param {Core} core @param {(text: string) => void} announce */
+/**
+ * @param {Core} core
+ * @param {(text: string) => void} announce
+ */
 export function volumesPanel(core, announce) {
   /** @type {Map<string, any>} */
   const known = new Map();
@@ -83,7 +86,10 @@ export function volumesPanel(core, announce) {
 
 /**
  * Sends files in chunks, in order, each again if the link broke. Returns the volume's entry.
- * @param {Core} core @param {string} name @param {File[]} files @param {AbortSignal} signal
+ * @param {Core} core
+ * @param {string} name
+ * @param {File[]} files
+ * @param {AbortSignal} signal
  * @param {(done: number, all: number) => void} progress
  */
 async function upload(core, name, files, signal, progress) {

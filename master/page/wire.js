@@ -11,7 +11,8 @@ export const TILE_TYPES = ["", "image/jpeg", "image/webp", "image/png"];
 
 /**
  * Takes a binary message apart. Returns null for what is no tile of version 1.
- * @param {ArrayBuffer} buffer @returns {Tile|null}
+ * @param {ArrayBuffer} buffer
+ * @returns {Tile|null}
  */
 export function parseTile(buffer) {
   if (buffer.byteLength <= HEADER_BYTES) return null;
@@ -31,7 +32,10 @@ export function parseTile(buffer) {
   return inside ? tile : null;
 }
 
-/** Decodes without colour management, so that pixels are the file's. @param {Tile} tile */
+/**
+ * Decodes without colour management, so that pixels are the file's.
+ * @param {Tile} tile
+ */
 export async function decodeTile(tile) {
   const bitmap = await createImageBitmap(new Blob([tile.data], { type: TILE_TYPES[tile.kind] }),
     { colorSpaceConversion: "none", premultiplyAlpha: "none" });
@@ -39,10 +43,18 @@ export async function decodeTile(tile) {
   return bitmap;
 }
 
-/** Order of two pairs (seq, scene): below 0 if `a` is older. @param {{seq: number, scene: number}} a @param {{seq: number, scene: number}} b */
+/**
+ * Order of two pairs (seq, scene): below 0 if `a` is older.
+ * @param {{seq: number, scene: number}} a
+ * @param {{seq: number, scene: number}} b
+ */
 export const pairOrder = (a, b) => a.seq - b.seq || a.scene - b.scene;
 
-/** Milliseconds to wait before dialling again, after `tries` in vain. @param {number} tries @param {number} chance  0 to 1 */
+/**
+ * Milliseconds to wait before dialling again, after `tries` in vain.
+ * @param {number} tries
+ * @param {number} chance  0 to 1
+ */
 export const waitBeforeDial = (tries, chance) => Math.min(250 * 2 ** tries, 8000) * (0.75 + 0.5 * chance);
 
 /** Close codes after which dialling again is no use until somebody did something. */
@@ -54,11 +66,17 @@ export class Signals {
     /** @type {Map<string, ((x: any) => void)[]>} */
     this.listeners = new Map();
   }
-  /** @param {string} name @param {(x: any) => void} f */
+  /**
+   * @param {string} name
+   * @param {(x: any) => void} f
+   */
   on(name, f) {
     this.listeners.set(name, [...(this.listeners.get(name) ?? []), f]);
   }
-  /** @param {string} name @param {any} [x] */
+  /**
+   * @param {string} name
+   * @param {any} [x]
+   */
   emit(name, x) {
     for (const f of this.listeners.get(name) ?? []) f(x);
   }
@@ -149,14 +167,20 @@ export class Wire extends Signals {
     } else if (silent > 12_000) this.send({ type: "ping", t: Math.round(performance.now()) });
   }
 
-  /** Sends if there is a connection; says whether. @param {object} message */
+  /**
+   * Sends if there is a connection; says whether.
+   * @param {object} message
+   */
   send(message) {
     if (this.socket?.readyState !== WebSocket.OPEN) return false;
     this.socket.send(JSON.stringify(message));
     return true;
   }
 
-  /** Sends a message with a fresh id, and returns it. @param {object} message */
+  /**
+   * Sends a message with a fresh id, and returns it.
+   * @param {object} message
+   */
   ask(message) {
     const id = ++this.lastId;
     this.send({ ...message, id });

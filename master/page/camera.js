@@ -182,7 +182,7 @@ export function camOfKey(key, o, home) {
     cam.elevation = rounded((Math.asin(high) * 180) / Math.PI, 0.01);
     cam.azimuth = rounded((Math.atan2(dot(level, o.side), dot(level, o.front)) * 180) / Math.PI, 0.01);
     const flat = eyeAxes({ ...cam, roll: 0 }, o);
-    const lean = Math.atan2(dot(pictureUp, flat.right), -dot(pictureUp, flat.down));
+    const lean = Math.atan2(-dot(pictureUp, flat.right), -dot(pictureUp, flat.down));
     cam.roll = rounded((lean * 180) / Math.PI, 0.01) || 0;
   } else {
     cam.azimuth = key.azimuth ?? 0;
@@ -382,7 +382,7 @@ export function camWords(cam, o, anatomical) {
     const [azimuth, elevation] = sideAngles(side, o);
     const pole = Math.abs(elevation) === 90;
     const near = pole ? Math.abs(cam.elevation - elevation) < 0.5
-      : Math.abs(wrap(cam.azimuth - azimuth)) < 0.5;
+      : Math.abs(cam.elevation) < 89.5 && Math.abs(wrap(cam.azimuth - azimuth)) < 0.5;
     if (near) return `from ${anatomical ? side : sidePlain(side)}${pole ? "" : tilt}`;
   }
   return `azimuth ${Math.round(cam.azimuth)}°${tilt}`;

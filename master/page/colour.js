@@ -4,7 +4,7 @@
  */
 
 import { clamp, keyOfCam } from "./camera.js";
-import { h, icon, numberField, numberWords, segments, setAttr, setText } from "./dom.js";
+import { byId, h, icon, numberField, numberWords, segments, setAttr, setText } from "./dom.js";
 import { aimAtPicked } from "./input.js";
 import { TfView } from "./tf-view.js";
 import {
@@ -22,9 +22,8 @@ const FIRST_PRESETS = 8;
 /**
  * @param {Core} core
  * @param {import("./overlay.js").Overlay} overlay
- * @param {(tab: string) => void} open
  */
-export function colourPanel(core, overlay, open) {
+export function colourPanel(core, overlay) {
   const range = () => /** @type {import("./types.js").Volume} */ (core.volume).range;
   const put = (/** @type {any} */ tf, /** @type {string} */ tag) => core.change({ tf }, tag);
 
@@ -101,7 +100,7 @@ export function colourPanel(core, overlay, open) {
   });
   axis.set("fine");
   const zoomTo = h("button", {
-    type: "button", text: "Zoom to window", "aria-pressed": "false",
+    type: "button", text: "Zoom", title: "Zoom to the window", "aria-pressed": "false",
     onclick: () => {
       const [a, b] = windowOf(core.state.tf);
       const wide = Math.max(b - a, (range()[1] - range()[0]) / 200) * 1.5;
@@ -171,7 +170,7 @@ export function colourPanel(core, overlay, open) {
   const directionRow = h("div", { class: "fields three" }, ...direction.map((d) => d.el));
 
   // Picked values.
-  const picked = h("section", { class: "card picked-card", "aria-live": "polite", hidden: true });
+  const picked = byId("picked");
   let asked = /** @type {any} */ (null);
   core.on("picking", (p) => { asked = p; });
   core.wire.on("picked", (m) => {
@@ -180,7 +179,6 @@ export function colourPanel(core, overlay, open) {
     if (asked.aim) aimAtPicked(core, m);
     view.showPicked(m.ranges);
     drawPicked(m);
-    if (!asked.aim) open("colour");
   });
   const drawPicked = (/** @type {any} */ m) => {
     const close = h("button", { type: "button", class: "quiet", "aria-label": "Close", onclick: () => { picked.hidden = true; overlay.setMark(null); view.showPicked([]); } }, icon("close"));
@@ -195,7 +193,7 @@ export function colourPanel(core, overlay, open) {
     });
     const unit = core.volume.unit;
     picked.replaceChildren(
-      h("header", {}, h("h3", { text: `Pixel ${m.x}, ${m.y}` }), close),
+      h("header", {}, h("h2", { text: `Pixel ${m.x}, ${m.y}` }), close),
       m.hit ? h("p", { text: `Surface at ${m.hit.map((/** @type {number} */ x) => numberWords(x, 4)).join(", ")} ${unit}, value ${numberWords(m.value, 4)}` })
         : h("p", { text: "Nothing stops the light here." }),
       rows.length ? h("ul", {}, ...rows) : null,
@@ -266,19 +264,18 @@ export function colourPanel(core, overlay, open) {
 
   const presetName = h("output", { class: "aside" });
   const el = h("div", {},
-    picked,
-    h("section", {}, h("header", {}, h("h3", { text: "Presets" }), presetName, more), grid, mapsTitle, maps),
+    h("section", {}, h("header", {}, h("h2", { text: "Presets" }), presetName, more), grid, mapsTitle, maps),
     h("section", {},
-      h("header", {}, h("h3", { text: "Opacity and colour" })),
+      h("header", {}, h("h2", { text: "Opacity and colour" })),
       view.el,
       h("div", { class: "selected-row" }, which, remove),
       h("div", { class: "fields two" }, value.el, opacity.el, colourField),
       h("div", { class: "row" }, scale.el, axis.el, zoomTo)),
-    h("section", {}, h("header", {}, h("h3", { text: "Window" }), h("span", { class: "aside", text: "right-drag on the picture" })),
+    h("section", {}, h("header", {}, h("h2", { text: "Window" }), h("span", { class: "aside", text: "right-drag on the picture" })),
       h("div", { class: "fields two" }, from.el, to.el)),
-    h("section", {}, h("header", {}, h("h3", { text: "Light" })), light.el,
+    h("section", {}, h("header", {}, h("h2", { text: "Light" })), light.el,
       directionRow, h("div", { class: "fields two" }, ...lightFields.map((f) => f.el))),
-    h("section", {}, h("header", {}, h("h3", { text: "Borders" })), gradient),
+    h("section", {}, h("header", {}, h("h2", { text: "Borders" })), gradient),
     h("section", {}, table));
 
   core.on("volume", () => { view.zoom = null; picked.hidden = true; fillPresets(); });

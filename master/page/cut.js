@@ -16,7 +16,7 @@ const NAMES = { R: "right", L: "left", A: "front", P: "back", S: "top", I: "bott
 export function cutPanel(core, overlay) {
   /** @type {any[]} */
   const rows = [0, 1, 2].map((axis) => {
-    const title = h("h3");
+    const title = h("h2");
     const note = h("span", { class: "aside" });
     const ends = [0, 1].map((side) => {
       const field = numberField({ label: side ? "To" : "From", onchange: (x) => move(axis, /** @type {0|1} */ (side), x, false) });
@@ -45,9 +45,9 @@ export function cutPanel(core, overlay) {
     core.change({ crop: cropWith(core.state.crop, axis, side, x, core.volume.box) }, `crop${axis}${side}`, moving);
   const show = h("input", { type: "checkbox", checked: true, onchange: () => overlay.setBox(show.checked) });
   const reset = h("button", { type: "button", text: "Whole volume", onclick: () => core.change({ crop: noCrop() }, "") });
-  const halves = h("div", { class: "row" });
+  const halves = h("div", { class: "sides" });
   const el = h("div", {},
-    h("section", {}, h("header", {}, h("h3", { text: "Cut open" }), reset),
+    h("section", {}, h("header", {}, h("h2", { text: "Cut open" }), reset),
       h("p", { class: "hint", text: "Drag the squares in the picture, or set ends here. What lies outside is not drawn." }), halves,
       h("label", { class: "check" }, show, "Show the box and its handles")),
     ...rows.map((r) => r.el));
@@ -63,7 +63,7 @@ export function cutPanel(core, overlay) {
     halves.replaceChildren(...[0, 1, 2].map((axis) => {
       const side = core.axes.front[axis] || core.axes.up[axis] ? 1 : 0;
       const positive = (core.axes.front[axis] + core.axes.up[axis]) < 0 ? 0 : side;
-      const name = volume.anatomical ? `${NAMES[letters[axis][positive ? 0 : 1]]} half away` : `half of ${"xyz"[axis]} away`;
+      const name = volume.anatomical ? `${NAMES[letters[axis][positive ? 0 : 1]]} half off` : `half of ${"xyz"[axis]} off`;
       return h("button", { type: "button", text: name[0].toUpperCase() + name.slice(1), onclick: () => {
         const middle = (volume.box[0][axis] + volume.box[1][axis]) / 2;
         core.change({ crop: cropWith(core.state.crop, axis, /** @type {0|1} */ (positive ? 1 : 0), middle, volume.box) }, "");

@@ -71,6 +71,9 @@ export function setAttr(el, name, value) {
   else if (el.getAttribute(name) !== String(value)) el.setAttribute(name, value === true ? "" : String(value));
 }
 
+/** How much larger than on a small screen things are drawn: the root's font size over 13 pixels. */
+export const uiScale = () => parseFloat(getComputedStyle(document.documentElement).fontSize) / 13;
+
 let lastId = 0;
 /** @param {string} prefix */
 export const freshId = (prefix) => `${prefix}-${++lastId}`;

@@ -48,7 +48,7 @@ export function jobsPanel(core, announce) {
       row.cancel = h("button", { type: "button", class: "quiet", onclick: () => core.wire.ask({ type: "cancel_job", job: row.job }) }, icon("close"));
       row.save = h("button", { type: "button", class: "quiet", onclick: () => saveResult(known.get(row.job)) }, icon("save"));
       row.el = h("div", { class: "row-item job" }, row.canvas,
-        h("div", { class: "line" }, row.name, row.state, row.count), h("div", { class: "line" }, row.bar), h("div", { class: "line" }, row.words), h("div", { class: "act" }, row.save, row.cancel));
+        h("div", { class: "line" }, row.name, row.state), h("div", { class: "line" }, row.bar), h("div", { class: "line" }, row.words, row.count), h("div", { class: "act" }, row.save, row.cancel));
       return row;
     },
     fill: (row, job) => {
@@ -65,7 +65,7 @@ export function jobsPanel(core, announce) {
       setText(row.count, `${job.frames_done} / ${job.frames_total}`);
       row.bar.value = job.frames_total ? job.frames_done / job.frames_total : 0;
       setAttr(row.bar, "aria-label", `Progress of ${job.job}`);
-      setText(row.words, [`${job.volume}, ${job.size.join("×")}`, jobWords(job, now())].filter(Boolean).join(" · "));
+      setText(row.words, [jobWords(job, now()), `${job.volume}, ${job.size.join("×")}`].filter(Boolean).join(" · "));
       setAttr(row.words, "title", row.words.textContent);
       row.cancel.hidden = !OPEN.includes(job.state);
       setAttr(row.cancel, "aria-label", `Cancel ${job.job}`);
@@ -88,7 +88,7 @@ export function jobsPanel(core, announce) {
     const last = sorted().at(-1);
     if (last) core.wire.ask({ type: "jobs_page", before: last.job, count: 1000 });
   } });
-  const el = h("div", { class: "list-panel" }, h("header", {}, h("h3", { text: "Jobs" }), count, older), search, rows.el);
+  const el = h("div", { class: "list-panel" }, h("header", {}, h("h2", { text: "Jobs" }), count, older), search, rows.el);
   const sorted = () => [...known.values()].sort((a, b) => b.submitted_ms - a.submitted_ms);
   function draw() {
     const words = search.value.trim().toLowerCase();

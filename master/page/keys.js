@@ -17,7 +17,7 @@ export const KEY_LIST = [
   ["Keys", [
     ["← → ↑ ↓", "turn by 5° (Shift: 1°)"], ["Alt with arrows", "move"], ["+ −", "zoom"], ["[ ]", "lean by 5°"],
     ["1 to 6", "front, back, left, right, above, below"], ["P", "perspective or parallel"], ["F", "fit what is seen"], ["R", "first view"],
-    ["T X V K", "colour, cut, view, keep"], ["E J W O", "picture in numbers, jobs, workers, volumes"], ["H", "hide or show the panel"],
+    ["T X V K", "colour, cut, view, save"], ["D J W O", "details, jobs, workers, volumes"], ["H", "hide or show the panel"],
     ["S", "save the picture"], ["C", "copy the link"], ["Z, Shift Z", "undo, redo"], ["Space", "turn by itself"], ["?", "this list"],
   ]],
   ["Curve", [

@@ -27,7 +27,7 @@ const overlay = new Overlay(byId("overlay"), stage, core);
 const announce = (/** @type {string} */ text) => setText(byId("announce"), text);
 
 const panels = /** @type {Record<string, any>} */ ({
-  colour: colourPanel(core, overlay, (tab) => openTab(tab, false)),
+  colour: colourPanel(core, overlay),
   cut: cutPanel(core, overlay),
   view: viewPanel(core),
   save: savePanel(core),
@@ -172,7 +172,7 @@ byId("volume-button").addEventListener("click", () => openTab("volumes"));
 listenToHands(stage, core);
 listenToKeys(core, {
   t: () => openTab("colour"), x: () => openTab("cut"), v: () => openTab("view"), k: () => openTab("save"),
-  e: () => openTab("shown"), j: () => openTab("jobs"), w: () => openTab("workers"), o: () => openTab("volumes"),
+  d: () => openTab("shown"), j: () => openTab("jobs"), w: () => openTab("workers"), o: () => openTab("volumes"),
   h: () => openTab(open || lastOpen), f: () => fitView(core), r: () => core.emit("reset"),
   s: () => { savePicture(core, core.size, "png", false); }, c: () => { copyAddress(core); },
   z: () => core.step("undo"), "z+shift": () => core.step("redo"), Space: toggleSpin, "?": showHelp,

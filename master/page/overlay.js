@@ -8,7 +8,7 @@ import {
   sidePlain,
 } from "./camera.js";
 import { BOX_EDGES, boxCorner, cropBox, cropWith, dragAlong, faceMiddle } from "./crop.js";
-import { setAttr, svg } from "./dom.js";
+import { setAttr, svg, uiScale } from "./dom.js";
 
 /** @typedef {import("./core.js").Core} Core */
 /** @typedef {import("./types.js").Vec3} Vec3 */
@@ -111,8 +111,9 @@ export class Overlay {
     const { volume, state, axes } = core;
     setAttr(root, "viewBox", `0 0 ${width} ${height}`);
     root.classList.toggle("on-light", lightness(state.background) > 0.5);
+    const k = uiScale();
     const names = edgeLetters(state.cam, axes, volume.anatomical);
-    const places = { top: [width / 2, 18], bottom: [width / 2, height - 10], left: [12, height / 2 + 5], right: [width - 12, height / 2 + 5] };
+    const places = { top: [width / 2, 18 * k], bottom: [width / 2, height - 10 * k], left: [12 * k, height / 2 + 5], right: [width - 12 * k, height / 2 + 5] };
     for (const [side, [x, y]] of Object.entries(places)) {
       const el = this.letters[side];
       el.textContent = /** @type {any} */ (names)[side];
@@ -135,8 +136,9 @@ export class Overlay {
    */
   drawBar(width, height) {
     const { state, volume } = this.core;
-    const { mm, px } = scaleBar(state.cam.height / height, Math.min(160, width / 4));
-    const [x, y] = [width - 16 - px, height - 14];
+    const k = uiScale();
+    const { mm, px } = scaleBar(state.cam.height / height, Math.min(160 * k, width / 4));
+    const [x, y] = [width - 16 * k - px, height - 14 * k];
     setAttr(this.bar, "d", `M${x} ${y - 5}v5h${px}v-5`);
     setAttr(this.barText, "x", x + px / 2);
     setAttr(this.barText, "y", y - 9);
@@ -148,7 +150,9 @@ export class Overlay {
     const { state, axes, volume } = this.core;
     const { right, down, ahead } = eyeAxes(state.cam, axes);
     const letters = axisLetters(volume.anatomical);
-    const [cx, cy] = [52, height - 52];
+    const k = uiScale();
+    const [cx, cy] = [52 * k, height - 52 * k];
+    const half = CUBE * 0.58 * k;
     /** @type {any[]} */
     const shown = [];
     for (const axis of [0, 1, 2]) {
@@ -157,19 +161,19 @@ export class Overlay {
         n[axis] = sign;
         const facing = -dot(n, ahead);
         if (facing < 0.02) continue;
-        const [u, v] = [1, 2].map((k) => {
+        const [u, v] = [1, 2].map((next) => {
           const e = /** @type {Vec3} */ ([0, 0, 0]);
-          e[(axis + k) % 3] = 1;
+          e[(axis + next) % 3] = 1;
           return e;
         });
-        const flat = (/** @type {Vec3} */ p) => [cx + dot(p, right) * CUBE * 0.58, cy + dot(p, down) * CUBE * 0.58];
+        const flat = (/** @type {Vec3} */ p) => [cx + dot(p, right) * half, cy + dot(p, down) * half];
         const corner = (/** @type {number} */ a, /** @type {number} */ b) =>
           flat(/** @type {Vec3} */ (n.map((x, i) => x + a * u[i] + b * v[i]))).map((x) => x.toFixed(1)).join(" ");
         const [tx, ty] = flat(n);
         const face = svg("g", { class: "cube-face", "data-handle": "" },
           svg("path", { d: `M${corner(-1, -1)}L${corner(1, -1)}L${corner(1, 1)}L${corner(-1, 1)}z`, "fill-opacity": (0.15 + 0.35 * facing).toFixed(2) }));
         if (facing > 0.35) {
-          face.append(svg("text", { x: tx.toFixed(1), y: (ty + 4).toFixed(1), text: letters[axis][sign > 0 ? 0 : 1], opacity: Math.min(1, facing * 1.4).toFixed(2) }));
+          face.append(svg("text", { x: tx.toFixed(1), y: (ty + 4 * k).toFixed(1), text: letters[axis][sign > 0 ? 0 : 1], opacity: Math.min(1, facing * 1.4).toFixed(2) }));
         }
         face.addEventListener("pointerdown", (/** @type {Event} */ e) => e.stopPropagation());
         face.addEventListener("click", () => this.turnTo(n));

@@ -85,7 +85,7 @@ export function savePanel(core) {
   // Words to copy.
   const shown = segments("Words to copy", [["still", "Command"], ["film", "Movie"], ["python", "Python"]], (v) => { words = v; draw(); });
   let words = "still";
-  const code = h("pre", { tabindex: 0, "aria-label": "Words that draw this picture" });
+  const code = h("pre", { tabindex: 0, role: "textbox", "aria-readonly": "true", "aria-multiline": "true", "aria-label": "Words that draw this picture" });
   const copied = (/** @type {string} */ text, /** @type {string} */ what) => async () => {
     core.note("info", (await copyText(text)) ? `${what} is copied.` : "The browser does not let the page copy. Select the text by hand.");
   };
@@ -111,13 +111,13 @@ export function savePanel(core) {
     h("button", { type: "button", text: "Load colours…", onclick: () => load.click() }), load);
 
   const el = h("div", {},
-    h("section", {}, h("header", {}, h("h3", { text: "Picture" })),
+    h("section", {}, h("header", {}, h("h2", { text: "Picture" })),
       h("div", { class: "fields two" }, width.el, height.el, format.el), h("label", { class: "check" }, clear, "Transparent background"), save),
-    h("section", {}, h("header", {}, h("h3", { text: "Movie" }), frames), kind.el,
+    h("section", {}, h("header", {}, h("h2", { text: "Movie" }), frames), kind.el,
       h("div", { class: "fields two" }, degrees.el, seconds.el, fps.el, filmFormat.el), keysBox, make),
-    h("section", {}, h("header", {}, h("h3", { text: "The same picture elsewhere" })), shown.el, code,
+    h("section", {}, h("header", {}, h("h2", { text: "The same picture elsewhere" })), shown.el, code,
       h("div", { class: "row" }, copyWords, copyLink)),
-    h("section", {}, h("header", {}, h("h3", { text: "Files" })), files));
+    h("section", {}, h("header", {}, h("h2", { text: "Files" })), files));
 
   /** @type {string} */
   let keysShown = "";
@@ -127,7 +127,7 @@ export function savePanel(core) {
     if (text === keysShown) return;
     keysShown = text;
     keys.replaceChildren(...f.keys.map((stop, i) => h("li", {},
-      h("span", { text: `${camWords(stop.cam, core.axes, core.volume.anatomical)}, ${typeof stop.tf === "string" ? stop.tf : "own colours"}` }),
+      h("span", { text: `${i + 1}. ${camWords(stop.cam, core.axes, core.volume.anatomical)}, ${typeof stop.tf === "string" ? stop.tf : "own colours"}` }),
       h("button", { type: "button", text: "Show", "aria-label": `Show key ${i + 1}`, onclick: () => core.change({ cam: stop.cam }, "") }),
       h("button", { type: "button", text: "Set", "aria-label": `Set key ${i + 1} to this view`, onclick: () => film({ keys: f.keys.map((k, n) => (n === i ? { cam: core.state.cam, tf: tfChoice(core.state) } : k)) }) }),
       h("button", { type: "button", text: "Remove", "aria-label": `Remove key ${i + 1}`, onclick: () => film({ keys: f.keys.filter((_, n) => n !== i) }) }))));

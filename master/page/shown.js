@@ -19,6 +19,9 @@ export function largestError(error) {
   return values.length ? Math.max(...values.map((e) => /** @type {any} */ (e).value)) : null;
 }
 
+/** @param {number} ms */
+const msWords = (ms) => (ms < 9.95 ? ms.toFixed(1) : String(Math.round(ms)));
+
 /**
  * @param {Core} core
  * @param {any} strip
@@ -31,10 +34,10 @@ export function shownPanel(core, strip) {
   const noErrors = h("p", { class: "hint" });
   const left = h("ul", { class: "plain" });
   const el = h("div", {},
-    h("section", {}, h("header", {}, h("h3", { text: "This picture" })), facts),
-    h("section", {}, h("header", {}, h("h3", { text: "How far it may be off" }), h("span", { class: "aside", text: "in 1/255" })),
+    h("section", {}, h("header", {}, h("h2", { text: "This picture" })), facts),
+    h("section", {}, h("header", {}, h("h2", { text: "How far it may be off" }), h("span", { class: "aside", text: "in 1/255" })),
       h("table", { class: "numbers" }, h("thead", {}, h("tr", {}, h("th", { scope: "col", text: "Source" }), h("th", { scope: "col", text: "Off" }), h("th", { scope: "col", text: "Kind" }))), errors), noErrors),
-    h("section", {}, h("header", {}, h("h3", { text: "Left out, since this scene does not need it" })), left));
+    h("section", {}, h("header", {}, h("h2", { text: "Left out" }), h("span", { class: "aside", text: "this scene does not need it" })), left));
   let hash = /** @type {any} */ (null);
   /** @type {any} */
   let last = null;
@@ -44,7 +47,7 @@ export function shownPanel(core, strip) {
     const stale = core.status.state !== "live";
     strip.dataset.state = stale ? "stale" : still ? "still" : "moving";
     setText(parts.state, stale ? "old picture" : still ? "sharp" : "moving");
-    setText(parts.ms, `${last.ms.total < 9.95 ? last.ms.total.toFixed(1) : Math.round(last.ms.total)} ms`);
+    setText(parts.ms, `${msWords(last.ms.total)} ms`);
     setText(parts.level, last.level ? `level ${last.level}` : "full level");
     const off = still ? largestError(last.error) : last.bound * 255;
     setText(parts.error, off === null || Number.isNaN(off) ? "" : `off ≤ ${off < 9.95 ? off.toFixed(1) : Math.round(off)}/255`);
@@ -55,7 +58,7 @@ export function shownPanel(core, strip) {
     const rows = [
       ["Pass", still ? "still: the pixels of the file" : "moving: a preview"],
       ["Size", last.size.join(" × ")],
-      ["Time", `${last.ms.total.toFixed(1)} ms: ${last.ms.draw.toFixed(1)} drawing, ${last.ms.encode.toFixed(1)} encoding, ${last.ms.wait.toFixed(1)} waiting`],
+      ["Time", `${msWords(last.ms.total)} ms: ${msWords(last.ms.draw)} drawing, ${msWords(last.ms.encode)} encoding, ${msWords(last.ms.wait)} waiting`],
       ["Level", String(last.level)],
       ["Sheets", last.thickness ? `${Number(last.thickness.toFixed(3))} vox thick` : "–"],
       ["Drawn by", `${last.workers} worker${last.workers === 1 ? "" : "s"}, ${last.threads} threads`],

@@ -57,8 +57,9 @@ export class TfView {
     this.window, this.strip, this.stops, this.points);
     this.listen();
     new ResizeObserver(([entry]) => {
-      const width = Math.round(entry.contentRect.width);
-      if (width > 50 && width !== this.width) { this.width = width; this.draw(); }
+      const { width: w, height } = entry.contentRect;
+      const width = Math.round((w * EDGE.height) / height);
+      if (height > 50 && width !== this.width) { this.width = width; this.draw(); }
     }).observe(this.el);
   }
 

@@ -364,8 +364,11 @@ function srgbStops(tf) {
    * @param {number} depth
    */
   const divide = (a, b, depth) => {
-    const [p, q, m] = [colorAt(tf, a), colorAt(tf, b), colorAt(tf, (a + b) / 2)];
-    if (depth < 6 && m.some((c, i) => Math.abs(c - (p[i] + q[i]) / 2) > 0.5 / 255)) {
+    const [p, q] = [colorAt(tf, a), colorAt(tf, b)];
+    // Near black the curve is steepest at an end, where the middle alone sees little of it.
+    const off = [0.25, 0.5, 0.75].some((t) =>
+      colorAt(tf, a + (b - a) * t).some((c, i) => Math.abs(c - p[i] * (1 - t) - q[i] * t) > 0.45 / 255));
+    if (depth < 8 && off) {
       divide(a, (a + b) / 2, depth + 1);
       divide((a + b) / 2, b, depth + 1);
     } else {

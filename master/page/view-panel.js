@@ -49,7 +49,7 @@ export function viewPanel(core) {
   const axes = [["+x"], ["-x"], ["+y"], ["-y"], ["+z"], ["-z"]].map(([a]) => /** @type {[string, string]} */ ([a, a.replace("-", "−")]));
   const up = choice("Up", axes, (v) => core.change({ up: v === core.volume.up ? null : v, front: null }, ""));
   const front = choice("Front", axes, (v) => core.change({ front: v, up: core.state.up }, ""));
-  const standing = h("section", {}, h("header", {}, h("h3", { text: "How it stands" })),
+  const standing = h("section", {}, h("header", {}, h("h2", { text: "How it stands" })),
     h("p", { class: "hint", text: "The file does not say. If it lies on its side, choose another up." }),
     h("div", { class: "fields two" }, up.el, front.el));
   const quality = choice("At rest", [["", "As slabcast render"], ["1", "Error at most 1/255"], ["0.3", "Error at most 0.3/255"], ["b50", "50 ms a picture"], ["b200", "200 ms a picture"]], (v) => {
@@ -57,13 +57,13 @@ export function viewPanel(core) {
     core.change({ quality: q }, "");
   });
   const el = h("div", {},
-    h("section", {}, h("header", {}, h("h3", { text: "From" })), sides, h("div", { class: "row" }, fit, whole)),
-    h("section", {}, h("header", {}, h("h3", { text: "Camera" })), lens.el,
+    h("section", {}, h("header", {}, h("h2", { text: "From" })), sides, h("div", { class: "row" }, fit, whole)),
+    h("section", {}, h("header", {}, h("h2", { text: "Camera" })), lens.el,
       h("div", { class: "fields two" }, azimuth.el, elevation.el, roll.el, height.el, fov.el)),
-    h("section", {}, h("header", {}, h("h3", { text: "Looks at" }), h("span", { class: "aside", text: "double click on the picture" })),
+    h("section", {}, h("header", {}, h("h2", { text: "Looks at" }), h("span", { class: "aside", text: "double click on the picture" })),
       h("div", { class: "fields three" }, ...target.map((t) => t.el))),
-    h("section", {}, h("header", {}, h("h3", { text: "Background" })), swatches),
-    h("section", {}, h("header", {}, h("h3", { text: "Quality" })), h("div", { class: "fields" }, quality.el)),
+    h("section", {}, h("header", {}, h("h2", { text: "Background" })), swatches),
+    h("section", {}, h("header", {}, h("h2", { text: "Quality" })), h("div", { class: "fields" }, quality.el)),
     standing);
   core.on("volume", (volume) => {
     standing.hidden = volume.anatomical;

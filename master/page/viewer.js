@@ -63,6 +63,24 @@ export class Viewer {
   measure() {
     const { width, height } = this.stage.getBoundingClientRect();
     if (width > 1 && height > 1) this.core.resize([width, height], Math.min(devicePixelRatio || 1, 2));
+    this.place(this.moving);
+    this.place(this.still);
+  }
+
+  /**
+   * Lays a canvas over the stage: as high as it is, in its own shape, so that an old picture is not
+   * distorted while the stage changes; and pixel on pixel where it has the screen's.
+   * @param {any} canvas
+   */
+  place(canvas) {
+    const { width, height } = this.stage.getBoundingClientRect();
+    const dpr = devicePixelRatio || 1;
+    let scale = height / canvas.height;
+    if (Math.abs(canvas.height - height * dpr) < 1) scale = 1 / dpr;
+    const left = Math.round(((width - canvas.width * scale) / 2) * dpr) / dpr;
+    canvas.style.width = `${canvas.width * scale}px`;
+    canvas.style.height = `${canvas.height * scale}px`;
+    canvas.style.left = `${Math.abs(left) < 1 ? 0 : left}px`;
   }
 
   /** @param {Tile} tile */
@@ -118,8 +136,10 @@ export class Viewer {
       if (!hidden && still.width) {
         [moving.width, moving.height] = [still.width, still.height];
         this.movingCtx.drawImage(still, 0, 0);
+        this.place(moving);
       }
       [still.width, still.height] = pass.size;
+      this.place(still);
       still.hidden = false;
     }
     this.advance(pass);
@@ -130,6 +150,7 @@ export class Viewer {
     if (!pass.still) {
       if (!pass.complete) return;
       [this.moving.width, this.moving.height] = pass.size;
+      this.place(this.moving);
       for (const { bitmap, x, y } of pass.ready) this.movingCtx.drawImage(bitmap, x, y);
       this.still.hidden = true;
       this.finish(pass);

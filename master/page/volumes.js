@@ -17,12 +17,12 @@ export function volumesPanel(core, announce) {
   /** @type {Map<string, any>} */
   const known = new Map();
   const rows = new Rows({
-    label: "Volumes", rem: 3.6, empty: "No volume yet. Drop a file here.",
+    label: "Volumes", rem: 4.1, empty: "No volume yet. Drop a file here.",
     make: () => {
       const row = /** @type {any} */ ({});
       row.name = h("b");
       row.words = h("span", { class: "dim" });
-      row.open = h("button", { type: "button", class: "row-open", onclick: () => core.openVolume(row.volume) }, h("span", { class: "line" }, row.name), h("span", { class: "line" }, row.words));
+      row.open = h("button", { type: "button", class: "row-open", onclick: () => { if (!row.problem) core.openVolume(row.volume); } }, h("span", { class: "line" }, row.name), h("span", { class: "line" }, row.words));
       row.remove = h("button", { type: "button", class: "quiet", onclick: () => core.wire.ask({ type: "remove_volume", volume: row.volume }) }, icon("bin"));
       row.el = h("div", { class: "row-item volume" }, row.open, h("div", { class: "act" }, row.remove));
       return row;
@@ -35,17 +35,18 @@ export function volumesPanel(core, announce) {
       setAttr(row.words, "title", row.words.textContent);
       row.words.classList.toggle("bad", !!v.problem);
       setAttr(row.open, "aria-current", v.name === core.volume?.name ? "true" : null);
-      setAttr(row.open, "disabled", !!v.problem);
+      row.problem = v.problem;
+      setAttr(row.open, "aria-disabled", v.problem ? "true" : null);
       row.remove.hidden = v.origin !== "upload";
       setAttr(row.remove, "aria-label", `Remove ${v.name}`);
     },
   });
   const input = h("input", { type: "file", multiple: true, class: "away", tabindex: -1, "aria-hidden": "true", onchange: () => { begin([...input.files]); input.value = ""; } });
   const pick = h("button", { type: "button", text: "Choose files…", onclick: () => input.click() });
-  const zone = h("div", { class: "drop-zone" }, h("p", { text: "Drop a volume anywhere on the page: NIfTI, NRRD, MetaImage, TIFF, DICOM folder and others." }), pick, input);
+  const zone = h("div", { class: "drop-zone" }, h("p", { text: "Drop a file or a DICOM folder anywhere on the page." }), pick, input);
   const uploads = h("div", { class: "uploads" });
   const count = h("span", { class: "aside" });
-  const el = h("div", { class: "list-panel" }, h("header", {}, h("h3", { text: "Volumes" }), count), zone, uploads, rows.el);
+  const el = h("div", { class: "list-panel" }, h("header", {}, h("h2", { text: "Volumes" }), count), zone, uploads, rows.el);
   const draw = () => {
     setText(count, `${known.size}`);
     rows.set([...known.values()].sort((a, b) => a.name.localeCompare(b.name)));

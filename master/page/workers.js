@@ -11,7 +11,7 @@ export function workersPanel(core) {
   const known = new Map();
   const now = () => Date.now() + core.clockOffset;
   const rows = new Rows({
-    label: "Workers", rem: 5, empty: "No worker is connected. Start one: slabcast worker --master HOST:PORT",
+    label: "Workers", rem: 6.9, empty: "No worker is connected. Start one: slabcast worker --master HOST:PORT",
     make: () => {
       const row = /** @type {any} */ ({});
       row.name = h("b");
@@ -22,7 +22,7 @@ export function workersPanel(core) {
       row.memoryWords = h("span", { class: "count" });
       row.words = h("span", { class: "dim" });
       row.el = h("div", { class: "row-item worker" }, h("div", { class: "line" }, row.name, row.state),
-        h("div", { class: "line meters" }, h("span", { class: "dim", text: "threads" }), row.busy, row.busyWords, h("span", { class: "dim", text: "memory" }), row.memory, row.memoryWords),
+        h("div", { class: "meters" }, h("span", { class: "dim", text: "Threads" }), row.busy, row.busyWords, h("span", { class: "dim", text: "Memory" }), row.memory, row.memoryWords),
         h("div", { class: "line" }, row.words));
       return row;
     },
@@ -44,7 +44,7 @@ export function workersPanel(core) {
     },
   });
   const count = h("span", { class: "aside" });
-  const el = h("div", { class: "list-panel" }, h("header", {}, h("h3", { text: "Workers" }), count), rows.el);
+  const el = h("div", { class: "list-panel" }, h("header", {}, h("h2", { text: "Workers" }), count), rows.el);
   const draw = () => {
     const list = [...known.values()];
     const threads = list.reduce((n, w) => n + w.threads, 0);

@@ -278,8 +278,20 @@ export function colourPanel(core, overlay) {
     h("section", {}, h("header", {}, h("h2", { text: "Borders" })), gradient),
     h("section", {}, table));
 
-  core.on("volume", () => { view.zoom = null; picked.hidden = true; fillPresets(); });
+  core.on("volume", () => {
+    view.zoom = null;
+    picked.hidden = true;
+    shown = { tf: null, preset: null, cam: null };
+    fillPresets();
+  });
+  /** @type {any} function that is drawn, and camera that presets are drawn from */
+  let shown = { tf: null, preset: null, cam: null };
   core.on("state", (state) => {
+    // A turn changes the camera a hundred times a second, and nothing here but the thumbnails.
+    if (state.cam !== shown.cam) askThumbs();
+    const same = state.tf === shown.tf && state.preset === shown.preset;
+    shown = state;
+    if (same) return;
     view.draw();
     drawSelected();
     const [a, b] = windowOf(state.tf);
@@ -299,7 +311,6 @@ export function colourPanel(core, overlay) {
     gradientPoints[1].set(points ? points[points.length - 1][0] : null);
     gradientPoints[2].set(points ? points[0][1] : null);
     drawTable();
-    askThumbs();
   });
   core.on("status", (s) => { if (s.state === "live") askThumbs(); });
   return { el, shown: () => { view.draw(); askThumbs(); } };

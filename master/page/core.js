@@ -85,7 +85,6 @@ export class Core extends Signals {
     }
     this.wanted = await this.documentOfAddress();
     this.wire.dial();
-    addEventListener("popstate", () => this.followAddress());
     addEventListener("hashchange", () => this.followAddress());
   }
 
@@ -190,7 +189,7 @@ export class Core extends Signals {
   change(patch, tag, moving = false) {
     if (!this.steps) return;
     const next = { ...this.state, ...patch };
-    if (patch.tf && !("preset" in patch)) next.preset = null;
+    if (patch.tf && patch.tf !== this.state.tf && !("preset" in patch)) next.preset = null;
     this.steps.push(next, tag, performance.now());
     this.send(patch, moving);
   }
@@ -245,6 +244,7 @@ export class Core extends Signals {
     this.dpr = dpr;
     if (!this.volume) return;
     this.dirty.view = true;
+    this.moving.view = true;
     this.emit("state", this.state);
     this.schedule();
   }

@@ -15,12 +15,18 @@ import { fadedBy, windowOf, withWindow } from "./tf.js";
 const CLICK_PX = 4;
 
 /**
+ * Smallest sample spacing in mm.
+ * @param {import("./types.js").Volume} volume
+ */
+export const voxOf = (volume) => Math.min(...volume.steps.map((s) => Math.hypot(...s)));
+
+/**
  * Heights in mm that can be shown.
  * @param {import("./types.js").Volume} volume
  * @returns {[number, number]}
  */
 export function heightLimits(volume) {
-  const vox = Math.min(...volume.steps.map((s) => Math.hypot(...s)));
+  const vox = voxOf(volume);
   const extent = Math.max(...[0, 1, 2].map((a) => volume.box[1][a] - volume.box[0][a]));
   return [2 * vox, 20 * extent];
 }

@@ -125,7 +125,9 @@ core.on("painted", (m) => {
   labelTimer = setTimeout(() => {
     const { state, volume } = core;
     const look = state.preset ?? "own colours";
-    setAttr(viewer.still, "aria-label", `${volume.name}, ${look}, ${camWords(state.cam, core.axes, volume.anatomical)}, ${m.pass === "still" ? "sharp" : "moving"}`);
+    const where = `${look}, ${camWords(state.cam, core.axes, volume.anatomical)}, ${m.pass === "still" ? "sharp" : "moving"}`;
+    setAttr(viewer.still, "aria-label", `${volume.name}, ${where}`);
+    if (document.activeElement === stage && m.pass === "still") announce(where);
   }, 250);
 });
 core.on("reset", () => core.adopt({ ...core.state, cam: homeState(core.volume).cam }, ""));

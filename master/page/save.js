@@ -6,6 +6,7 @@ import { filmCommand, pasteable, pythonLines, stillCommand } from "./commands.js
 import { documentOf, filmPath, stillPath, tfChoice } from "./state.js";
 import { paraviewOf, readTf } from "./tf.js";
 import { camWords } from "./camera.js";
+import { voxOf } from "./input.js";
 
 /** @typedef {import("./core.js").Core} Core */
 
@@ -99,7 +100,7 @@ export function savePanel(core) {
     load.value = "";
     if (!file) return;
     try {
-      core.change({ tf: readTf(await file.text(), core.volume.range) }, "");
+      core.change({ tf: readTf(await file.text(), core.volume.range, voxOf(core.volume)) }, "");
       core.note("info", `${file.name} colours the picture.`);
     } catch (e) { core.note("error", /** @type {Error} */ (e).message); }
   });

@@ -71,12 +71,13 @@ export function colorAt(tf, x) {
  * Returns the transfer function over values and with every field written out.
  * @param {any} tf
  * @param {[number, number]} range  smallest and largest value
+ * @param {number} [vox]  smallest sample spacing in mm, for gradients given as shares
  * @returns {Tf}
  */
-export function plainTf(tf, range) {
+export function plainTf(tf, range, vox = 1) {
   const [lo, hi] = range;
   const at = tf.domain === "unit" ? (/** @type {number} */ x) => lo + x * (hi - lo) : (/** @type {number} */ x) => x;
-  const gradient = tf.domain === "unit" ? null : tf.gradient_opacity;
+  const perShare = tf.domain === "unit" ? (hi - lo) / vox : 1;
   /** @type {Tf} */
   const plain = {
     version: 1,
@@ -88,7 +89,9 @@ export function plainTf(tf, range) {
     nan: tf.nan ?? { color: [0, 0, 0], opacity: 0 },
     shading: { ...LIGHT, ...tf.shading },
   };
-  if (gradient?.length) plain.gradient_opacity = gradient.map((/** @type {number[]} */ p) => [...p]);
+  if (tf.gradient_opacity?.length) {
+    plain.gradient_opacity = tf.gradient_opacity.map((/** @type {number[]} */ [g, f]) => [g * perShare, f]);
+  }
   return plain;
 }
 
@@ -100,6 +103,7 @@ export function plainTf(tf, range) {
 export function tfProblem(tf) {
   if (typeof tf !== "object" || !tf) return "is no transfer function";
   if (tf.version !== 1) return "has no \"version\": 1";
+  if (tf.opacity_unit === "extinction") return "gives extinctions, and the page edits alpha_per_vox alone; slabcast render --tf takes it";
   for (const [field, length] of /** @type {[string, number][]} */ ([["colors", 4], ["opacities", 2]])) {
     const points = tf[field];
     if (!Array.isArray(points) || !points.length) return `has no ${field}`;
@@ -400,10 +404,11 @@ export function paraviewOf(tf, name) {
  * Reads our JSON, or a ParaView colour map in RGB.
  * @param {string} text
  * @param {[number, number]} range
+ * @param {number} [vox]  smallest sample spacing in mm
  * @returns {Tf}
  * @throws {Error} with a sentence that says what is wrong
  */
-export function readTf(text, range) {
+export function readTf(text, range, vox = 1) {
   let json;
   try { json = JSON.parse(text); } catch (e) { throw new Error(`This is no JSON: ${/** @type {Error} */ (e).message}.`); }
   const map = Array.isArray(json) ? json[0] : json;
@@ -421,5 +426,5 @@ export function readTf(text, range) {
   }
   const problem = tfProblem(json);
   if (problem) throw new Error(`The file ${problem}.`);
-  return plainTf(json, range);
+  return plainTf(json, range, vox);
 }

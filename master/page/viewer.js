@@ -53,11 +53,20 @@ export class Viewer {
     this.pass = null;
     /** @type {{seq: number, scene: number}} newest pair on the screen */
     this.shown = { seq: -1, scene: -1 };
+    /** @type {{seq: number, scene: number}|null} pair of the still that was hashed last */
+    this.hashed = null;
     core.wire.on("tile", (t) => { if (!t.thumb) this.tile(t); });
     core.wire.on("done", (m) => this.done(m));
     core.wire.on("status", (s) => { if (s.state !== "live") this.pass = null; });
     new ResizeObserver(() => this.measure()).observe(stage);
     this.measure();
+  }
+
+  /** Whether the still of the latest view and scene is on the screen, whole and hashed. */
+  get atRest() {
+    const { seq, rev, dirty, moving } = this.core;
+    const waiting = dirty.view || dirty.scene || moving.view || moving.scene;
+    return !waiting && this.hashed?.seq === seq && this.hashed.scene === rev;
   }
 
   measure() {
@@ -101,7 +110,11 @@ export class Viewer {
 
   /** @param {Pass} pass */
   begin(pass) {
-    if (this.pass) this.drop(this.pass);
+    if (this.pass) {
+      this.drop(this.pass);
+      // It was sent to its end, so its place in flight is free.
+      if (this.pass.done) this.acknowledge(this.pass.done, this.pass.doneAt);
+    }
     this.pass = pass;
     if (!pass.still) return;
     // Over a preview of the same view tiles show as they come.
@@ -118,7 +131,10 @@ export class Viewer {
   /** @param {any} message */
   done(message) {
     const pass = this.pass;
-    if (!pass || !pass.is({ seq: message.seq, scene: message.scene, still: message.pass === "still" })) return;
+    if (!pass || !pass.is({ seq: message.seq, scene: message.scene, still: message.pass === "still" })) {
+      this.acknowledge(message, performance.now());
+      return;
+    }
     pass.done = message;
     pass.doneAt = performance.now();
     this.advance(pass);
@@ -171,13 +187,18 @@ export class Viewer {
     pass.done = null;
     this.drop(pass);
     this.shown = { seq: pass.seq, scene: pass.scene };
-    const { seq, scene } = pass;
-    this.core.wire.send({
-      type: "ack", seq, scene, pass: message.pass, painted_ms: Math.round(performance.now() - pass.doneAt),
-    });
+    this.acknowledge(message, pass.doneAt);
     this.core.done = message;
     this.core.emit("painted", { ...message, bound: pass.bound, damaged: pass.failed });
     if (pass.still) this.hash(pass, message);
+  }
+
+  /**
+   * @param {any} message  `done` of a pass
+   * @param {number} since  when it came
+   */
+  acknowledge({ seq, scene, pass }, since) {
+    this.core.wire.send({ type: "ack", seq, scene, pass, painted_ms: Math.round(performance.now() - since) });
   }
 
   /**
@@ -188,6 +209,8 @@ export class Viewer {
   async hash(pass, message) {
     const pixels = this.stillCtx.getImageData(0, 0, this.still.width, this.still.height).data;
     const hex = await sha256(pixels);
-    if (pass === this.pass) this.core.emit("hash", { hex, same: hex === message.sha256, message });
+    if (pass !== this.pass) return;
+    this.hashed = { seq: pass.seq, scene: pass.scene };
+    this.core.emit("hash", { hex, same: hex === message.sha256, message });
   }
 }

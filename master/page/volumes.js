@@ -100,6 +100,9 @@ async function upload(core, name, files, signal, progress) {
   const begun = await core.post("v1/uploads", { name, files: files.map((f) => ({ name: f.name, bytes: f.size })) });
   if (!begun.ok) throw new Error(await refusalWords(begun));
   const { upload: id, chunk_bytes: chunk, received } = await begun.json();
+  signal.addEventListener("abort", () => {
+    fetch(`v1/uploads/${id}`, { method: "DELETE", headers: core.headers }).catch(() => {});
+  });
   let done = received.reduce((/** @type {number} */ a, /** @type {number} */ b) => a + b, 0);
   progress(done, all);
   for (const [i, file] of files.entries()) {

@@ -130,13 +130,16 @@ export function pasteable({ command, files }) {
  * Lines of Python that fetch the same picture from this master (docs/reference/live.md).
  * @param {any} doc
  * @param {string} base  address of the page, without fragment
+ * @param {boolean} token  whether the master wants one; it is never written out
  */
-export function pythonLines(doc, base) {
-  return `import json, urllib.request
+export function pythonLines(doc, base, token) {
+  const headers = token ? `{"Content-Type": "application/json",
+                                  "Authorization": "Bearer " + os.environ["SLABCAST_TOKEN"]}` : '{"Content-Type": "application/json"}';
+  return `import json, ${token ? "os, " : ""}urllib.request
 
 scene = json.loads(${JSON.stringify(JSON.stringify(doc))})
 request = urllib.request.Request(${JSON.stringify(`${base}v1/picture`)}, json.dumps(scene).encode(),
-                                 {"Content-Type": "application/json"})
+                                 ${headers})
 open("picture.png", "wb").write(urllib.request.urlopen(request).read())
 `;
 }

@@ -70,7 +70,9 @@ export function cutPanel(core, overlay) {
       } });
     }));
   });
-  core.on("state", (state) => {
+  const draw = () => {
+    if (!core.steps || !core.volume || el.closest("[hidden]")) return;
+    const { state } = core;
     const { box, unit } = core.volume;
     const ends = cropBox(state.crop, box);
     setAttr(reset, "disabled", !isCropped(state.crop));
@@ -85,6 +87,7 @@ export function cutPanel(core, overlay) {
         if (Math.abs(Number(end.slider.value) - at[side]) >= 1) end.slider.value = String(Math.round(at[side]));
       });
     }
-  });
-  return { el, shown: () => overlay.setBox(show.checked), gone: () => overlay.setBox(false) };
+  };
+  core.on("state", draw);
+  return { el, shown: () => { draw(); overlay.setBox(show.checked); }, gone: () => overlay.setBox(false) };
 }

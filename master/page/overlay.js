@@ -26,6 +26,7 @@ export class Overlay {
     this.stage = stage;
     this.core = core;
     this.showBox = false;
+    this.frame = 0;
     /** @type {any} */
     this.mark = null;
     this.letters = Object.fromEntries(["top", "bottom", "left", "right"].map((side) =>
@@ -103,7 +104,15 @@ export class Overlay {
     this.draw();
   }
 
+  /** Draws before the next screen frame, once for any number of changes. */
   draw() {
+    this.frame ||= requestAnimationFrame(() => {
+      this.frame = 0;
+      this.drawNow();
+    });
+  }
+
+  drawNow() {
     const { core, root } = this;
     if (!core.volume || !core.steps) return;
     const { width, height } = this.rect();

@@ -153,7 +153,7 @@ export function savePanel(core) {
     drawKeys();
     shown.set(words);
     const base = location.href.replace(/[#?].*$/, "").replace(/[^/]*$/, "");
-    setText(code, words === "python" ? pythonLines(documentOf(core.state, core.volume, size()), base)
+    setText(code, words === "python" ? pythonLines(documentOf(core.state, core.volume, size()), base, !!core.token)
       : pasteable(words === "film" ? filmCommand(core.state, core.volume, size()) : stillCommand(core.state, core.volume, size())));
   }
   core.on("welcome", (m) => {

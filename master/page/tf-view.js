@@ -120,6 +120,7 @@ export class TfView {
   listen() {
     /** @type {any} */
     let drag = null;
+    let last = { time: 0, kind: "", u: 0, v: 0 };
     this.el.addEventListener("pointerdown", (/** @type {PointerEvent} */ e) => {
       if (e.button === 2 || !this.core.volume) return;
       this.el.focus({ preventScroll: true });
@@ -127,6 +128,21 @@ export class TfView {
       const kind = target?.dataset.kind ?? "";
       const index = Number(target?.dataset.index ?? 0);
       const at = this.at(e);
+      // Points are made anew as they are drawn, so that the browser sees no double click on one.
+      const twice = e.timeStamp - last.time < 350 && last.kind === kind && Math.hypot(at.u - last.u, at.v - last.v) < 6;
+      last = { time: twice ? 0 : e.timeStamp, kind, u: at.u, v: at.v };
+      if (twice && (kind === "point" || kind === "stop")) {
+        drag = null;
+        this.remove(kind, index);
+        return;
+      }
+      if (twice && at.v > this.bottom) {
+        drag = null;
+        const [tf, made] = withStop(this.tf, at.x, this.range);
+        this.put(tf, "", false);
+        this.select("stop", made);
+        return;
+      }
       drag = { kind, index, at, tf: this.tf, window: windowOf(this.tf) };
       if (kind === "point" || kind === "stop") this.select(kind, index);
       else if (kind === "") {
@@ -136,6 +152,7 @@ export class TfView {
           Object.assign(drag, { kind: "point", index: made, tf });
           this.selected = { kind: "point", index: made };
           this.put(tf, "", true);
+          last.kind = "point";
           this.onselect(this.selected);
         } else drag.kind = "whole";
       }
@@ -178,15 +195,6 @@ export class TfView {
       e.preventDefault();
       this.removeAt(e);
     });
-    this.el.addEventListener("dblclick", (/** @type {MouseEvent} */ e) => {
-      const target = /** @type {any} */ (e.target).closest("[data-kind]");
-      const at = this.at(e);
-      if (at.v > this.bottom && target?.dataset.kind !== "stop") {
-        const [tf, index] = withStop(this.tf, at.x, this.range);
-        this.put(tf, "", false);
-        this.select("stop", index);
-      } else this.removeAt(e);
-    });
     this.el.addEventListener("wheel", (/** @type {WheelEvent} */ e) => {
       e.preventDefault();
       const { x } = this.at(e);
@@ -200,9 +208,16 @@ export class TfView {
     this.el.addEventListener("keydown", (/** @type {KeyboardEvent} */ e) => this.key(e));
   }
 
+  /**
+   * What lies under the pointer: a captured pointer's clicks have the drawing itself as target.
+   * @param {MouseEvent} e
+   * @returns {any}
+   */
+  under(e) { return document.elementFromPoint(e.clientX, e.clientY)?.closest("[data-kind]"); }
+
   /** @param {MouseEvent} e */
   removeAt(e) {
-    const target = /** @type {any} */ (e.target).closest("[data-kind]");
+    const target = this.under(e);
     if (target?.dataset.kind === "point") this.remove("point", Number(target.dataset.index));
     if (target?.dataset.kind === "stop") this.remove("stop", Number(target.dataset.index));
   }

@@ -69,7 +69,9 @@ export function viewPanel(core) {
     standing.hidden = volume.anatomical;
     for (const b of sides.children) setText(b, sideWords(core, b.dataset.side).replace(/^./, (c) => c.toUpperCase()));
   });
-  core.on("state", (state) => {
+  const draw = () => {
+    if (!core.steps || !core.volume || el.closest("[hidden]")) return;
+    const { state } = core;
     const c = state.cam;
     azimuth.set(c.azimuth);
     elevation.set(c.elevation);
@@ -87,8 +89,9 @@ export function viewPanel(core) {
     for (const option of front.select.options) option.disabled = option.value.endsWith(up.select.value.slice(-1));
     const q = state.quality;
     quality.set(q.budget_ms ? `b${q.budget_ms}` : q.error ? String(Number((q.error * 255).toPrecision(3))) : "");
-  });
-  return { el };
+  };
+  core.on("state", draw);
+  return { el, shown: draw };
 }
 
 /**

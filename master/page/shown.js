@@ -4,6 +4,9 @@ import { bytesWords, h, setAttr, setText } from "./dom.js";
 
 /** @typedef {import("./core.js").Core} Core */
 
+/** A picture that is not there after this long is said to be drawn. */
+const LATE_MS = 200;
+
 /** Words for sources of error, as in docs/reference/statistics.md. */
 const SOURCES = {
   cutoff: "pixels shut early", quantisation: "colours in 8 bits", accumulation: "sums in 16 bits",
@@ -78,6 +81,17 @@ export function shownPanel(core, strip) {
       h("li", {}, h("span", { text: x.name }), h("b", { text: [x.saved_ms != null && `${x.saved_ms.toFixed(1)} ms`, x.saved_bytes && bytesWords(x.saved_bytes)].filter(Boolean).join(", ") })))
       : [h("li", { text: "Nothing." })]));
   };
+  /** @type {any} */
+  let lateTimer = 0;
+  /** Says so if what is on the screen is still not what was asked for. */
+  const late = () => {
+    lateTimer = 0;
+    if (!last || core.status.state !== "live" || (last.seq === core.seq && last.scene === core.rev)) return;
+    strip.dataset.state = "moving";
+    setText(parts.state, "drawing");
+    setText(parts.hash, "");
+  };
+  core.on("state", () => { lateTimer ||= setTimeout(late, LATE_MS); });
   core.on("painted", (m) => { last = { ...m, source: core.done }; draw(); });
   core.on("hash", (x) => { hash = x; draw(); });
   core.on("status", draw);

@@ -5,7 +5,8 @@
 
 import { clamp, keyOfCam } from "./camera.js";
 import { byId, h, icon, numberField, numberWords, segments, setAttr, setText } from "./dom.js";
-import { aimAtPicked } from "./input.js";
+import { BorderView } from "./border-view.js";
+import { aimAtPicked, voxOf } from "./input.js";
 import { TfView } from "./tf-view.js";
 import {
   changedStop, emphasised, movedPoint, opacityAt, plainTf, stopHex, windowOf, withLight, withPoint,
@@ -247,19 +248,22 @@ export function colourPanel(core, overlay) {
     numberField({ label: "All above", min: 0, onchange: (g) => setGradient(null, g, null) }),
     numberField({ label: "Flat parts keep", min: 0, max: 1, step: 0.05, onchange: (f) => setGradient(null, null, f) })];
   const gradientOn = h("input", { type: "checkbox", onchange: () => {
-    const most = core.volume.gradients?.to ?? (range()[1] - range()[0]) / 2;
+    const most = mostGradient();
     const { gradient_opacity: _, ...rest } = core.state.tf;
     put(gradientOn.checked ? { ...rest, gradient_opacity: [[round2(most * 0.05), 0], [round2(most * 0.3), 1]] } : rest, "");
   } });
+  const mostGradient = () => core.volume.gradients?.to ?? (range()[1] - range()[0]) / 2 / voxOf(core.volume);
+  const border = new BorderView((points, moving) => core.change({ tf: { ...core.state.tf, gradient_opacity: points } }, moving ? "tf-border" : "", moving), () => core.settle());
   const round2 = (/** @type {number} */ x) => Number(x.toPrecision(2));
   const setGradient = (/** @type {number|null} */ a, /** @type {number|null} */ b, /** @type {number|null} */ f) => {
     const points = core.state.tf.gradient_opacity ?? [[0, 0], [1, 1]];
     const [first, last] = [points[0], points[points.length - 1]];
     const lo = a ?? first[0];
     const hi = b ?? last[0];
-    put({ ...core.state.tf, gradient_opacity: [[Math.min(lo, hi), f ?? first[1]], [Math.max(lo, hi), last[1]]] }, "");
+    const inner = points.slice(1, -1).filter(([g]) => g > lo && g < hi);
+    put({ ...core.state.tf, gradient_opacity: [[Math.min(lo, hi), f ?? first[1]], ...inner, [Math.max(lo, hi), last[1]]] }, "");
   };
-  gradient.append(h("label", { class: "check" }, gradientOn, "Opaque at borders of materials alone"),
+  gradient.append(h("label", { class: "check" }, gradientOn, "Opaque at borders of materials alone"), border.el,
     h("div", { class: "fields three" }, ...gradientPoints.map((g) => g.el)));
 
   const presetName = h("output", { class: "aside" });
@@ -306,6 +310,8 @@ export function colourPanel(core, overlay) {
     for (const f of lightFields) { f.set(s[f.name]); f.input.disabled = !s.on; }
     const points = state.tf.gradient_opacity;
     gradientOn.checked = !!points;
+    border.el.toggleAttribute("hidden", !points);
+    border.set(points ?? [], mostGradient(), core.volume.gradients);
     gradientPoints.forEach((g) => { g.input.disabled = !points; });
     gradientPoints[0].set(points ? points[0][0] : null);
     gradientPoints[1].set(points ? points[points.length - 1][0] : null);

@@ -162,6 +162,7 @@ export class Core extends Signals {
     }
     this.emit("volume", volume);
     this.emit("state", this.state);
+    if (!same && location.hash.length > 1) this.keepAddress();
     // The master draws what the hello asked for, or the home view, without being told again.
     if (stale || this.size.join() !== this.toldSize) this.refresh();
   }
@@ -176,7 +177,9 @@ export class Core extends Signals {
 
   /** @param {string[]} of */
   watch(of) {
-    this.watched = new Set(["volumes", ...of]);
+    const next = new Set(["volumes", ...of]);
+    if ([...next].sort().join() === [...this.watched].sort().join()) return;
+    this.watched = next;
     this.wire.send({ type: "watch", of: [...this.watched] });
   }
 

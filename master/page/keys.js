@@ -14,15 +14,15 @@ export const KEY_LIST = [
     ["click", "values behind the pixel"], ["double click", "look at this point"],
     ["right drag", "window and level"], ["Ctrl right drag", "more or less opaque"], ["two fingers", "move, zoom and lean"],
   ]],
+  ["Curve", [
+    ["press", "add a point"], ["drag", "move it (Shift: one way)"], ["right or double click", "remove it"],
+    ["Alt drag", "move the whole curve"], ["double click on the strip", "add a colour"], ["wheel", "zoom along values"],
+  ]],
   ["Keys", [
     ["← → ↑ ↓", "turn by 5° (Shift: 1°)"], ["Alt with arrows", "move"], ["+ −", "zoom"], ["[ ]", "lean by 5°"],
     ["1 to 6", "front, back, left, right, above, below"], ["P", "perspective or parallel"], ["F", "fit what is seen"], ["R", "first view"],
     ["T X V K", "colour, cut, view, save"], ["D J W O", "details, jobs, workers, volumes"], ["H", "hide or show the panel"],
-    ["S", "save the picture"], ["C", "copy the link"], ["Z, Shift Z", "undo, redo"], ["Space", "turn by itself"], ["?", "this list"],
-  ]],
-  ["Curve", [
-    ["press", "add a point"], ["drag", "move it (Shift: one way)"], ["right or double click", "remove it"],
-    ["Alt drag", "move the whole curve"], ["double click on the strip", "add a colour"], ["wheel", "zoom along values"],
+    ["I", "values behind the middle"], ["S", "save the picture"], ["C", "copy the link"], ["Z, Shift Z", "undo, redo"], ["Space", "turn by itself"], ["?", "this list"],
   ]],
 ];
 

@@ -5,7 +5,7 @@ import { colourPanel } from "./colour.js";
 import { Core } from "./core.js";
 import { cutPanel } from "./cut.js";
 import { byId, h, icon, setAttr, setText } from "./dom.js";
-import { listenToHands } from "./input.js";
+import { listenToHands, pickAt } from "./input.js";
 import { jobsPanel } from "./jobs.js";
 import { fillHelp, listenToKeys } from "./keys.js";
 import { Overlay } from "./overlay.js";
@@ -61,7 +61,7 @@ function openTab(name, toggle = true) {
   }
   byId("panel").hidden = next === "";
   document.body.classList.toggle("closed", next === "");
-  if (next) core.watch(NEWS.includes(next) ? [next] : []);
+  core.watch(NEWS.includes(next) ? [next] : []);
   panels[next]?.shown?.();
 }
 
@@ -177,7 +177,7 @@ listenToKeys(core, {
   d: () => openTab("shown"), j: () => openTab("jobs"), w: () => openTab("workers"), o: () => openTab("volumes"),
   h: () => openTab(open || lastOpen), f: () => fitView(core), r: () => core.emit("reset"),
   s: () => { savePicture(core, core.size, "png", false); }, c: () => { copyAddress(core); },
-  z: () => core.step("undo"), "z+shift": () => core.step("redo"), Space: toggleSpin, "?": showHelp,
+  z: () => core.step("undo"), "z+shift": () => core.step("redo"), i: () => pickAt(core, core.size[0] >> 1, core.size[1] >> 1, false), Space: toggleSpin, "?": showHelp,
 });
 let lastOpen = "colour";
 tablist.addEventListener("click", () => { if (open) lastOpen = open; });
@@ -230,4 +230,7 @@ else openTab("", false);
 document.body.classList.toggle("closed", open === "");
 /** For tests: the page's state, without a way to change it but by hand. */
 Object.defineProperty(globalThis, "slabcast", { value: { core, viewer } });
+core.wire.on("welcome", () => viewer.measure());
+// The panel took its place: the first picture is asked for in the size that it will have.
+viewer.measure();
 core.start();

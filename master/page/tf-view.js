@@ -16,7 +16,7 @@ import {
 
 /** @typedef {import("./core.js").Core} Core */
 
-const EDGE = { left: 30, right: 10, top: 22, bottom: 44, strip: 14, height: 190 };
+const EDGE = { left: 32, right: 10, top: 22, bottom: 44, strip: 14, height: 190 };
 
 export class TfView {
   /**
@@ -331,7 +331,7 @@ export class TfView {
       const y = this.py(a).toFixed(1);
       return [
         svg("path", { d: `M${EDGE.left} ${y}H${right}` }),
-        svg("text", { x: EDGE.left - 5, y: Number(y) + 3.5, "text-anchor": "end", text: numberWords(a) }),
+        svg("text", { x: EDGE.left - 7, y: Number(y) + 3.5, "text-anchor": "end", text: numberWords(a) }),
       ];
     });
     const [lo, hi] = this.span;

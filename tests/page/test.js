@@ -145,6 +145,13 @@ story("functions over shares become functions over values", () => {
   const unit = tf.plainTf({ version: 1, domain: "unit", colors: [[0, 0, 0, 0], [1, 1, 1, 1]], opacities: [[0, 0], [0.5, 1]] }, [-1000, 3000]);
   same([unit.domain, unit.colors[1][0], unit.opacities[1][0]], ["value", 3000, 1000]);
 });
+story("gradients given as shares become changes a mm", () => {
+  const unit = { version: 1, domain: "unit", colors: [[0, 1, 1, 1]], opacities: [[0, 0], [1, 1]], gradient_opacity: [[0.1, 0], [0.5, 1]] };
+  same(tf.plainTf(unit, [0, 200], 2).gradient_opacity, [[10, 0], [50, 1]]);
+});
+story("extinctions are refused in words", () => {
+  refused(() => tf.readTf('{"version":1,"opacity_unit":"extinction","colors":[[0,1,1,1]],"opacities":[[0,5]]}', range), "extinctions");
+});
 story("points are added, moved between their neighbours, and removed", () => {
   const [more, i] = tf.withPoint(skin, 100, 0.5, range);
   same([i, more.opacities[3]], [3, [100, 0.5]]);

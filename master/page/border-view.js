@@ -27,7 +27,8 @@ export class BorderView {
     this.curve = svg("path", { class: "curve" });
     this.dots = svg("g", { class: "points" });
     this.ground = svg("rect", { class: "ground", x: FRAME.left, y: FRAME.top });
-    this.el = svg("svg", { class: "tf-view small", role: "img", "aria-label": "Share of the opacity by gradient. The numbers below say the same." },
+    this.el = svg("svg", { class: "tf-view small", role: "img",
+      "aria-label": "Share of the opacity by gradient. The numbers below say the same." },
       this.ground, this.bars, this.area, this.curve, this.dots);
     /** @type {any} */
     let drag = null;
@@ -114,7 +115,8 @@ export class BorderView {
     const step = this.histogram ? this.histogram.to / this.histogram.counts.length : 0;
     setAttr(this.bars, "d", this.histogram ? barHeights(this.histogram.counts, true).map((y, i) =>
       `M${px(i * step)} ${bottom}V${py(y)}H${px((i + 1) * step)}V${bottom}z`).join("") : "");
-    this.dots.replaceChildren(...this.points.map(([g, f], i) => svg("g", { "data-index": i, transform: `translate(${px(g)} ${py(f)})` },
+    this.dots.replaceChildren(...this.points.map(([g, f], i) => svg("g",
+      { "data-index": i, transform: `translate(${px(g)} ${py(f)})` },
       svg("circle", { r: 12, class: "hit" }), svg("circle", { r: 4.5 }))));
   }
 }

@@ -31,7 +31,8 @@ export function colourPanel(core, overlay) {
   // Presets.
   const grid = h("div", { class: "presets", role: "group", "aria-label": "Presets" });
   const maps = h("div", { class: "presets", role: "group", "aria-label": "Colour maps" });
-  const more = h("button", { type: "button", class: "link", "aria-expanded": "false", onclick: () => expand(!expanded) });
+  const more = h("button", { type: "button", class: "link", "aria-expanded": "false",
+    onclick: () => expand(!expanded) });
   let expanded = false;
   /** @type {Map<string, {button: any, canvas: any, drawn: boolean}>} */
   const buttons = new Map();
@@ -54,7 +55,8 @@ export function colourPanel(core, overlay) {
     thumbTimer = setTimeout(() => {
       if (!core.volume || core.status.state !== "live" || !grid.isConnected || !grid.offsetParent) return;
       thumbNames = [...buttons].filter(([, b]) => !b.button.hidden).map(([name]) => name).slice(0, 64);
-      thumbId = core.wire.ask({ type: "thumbs", of: "presets", names: thumbNames, size: THUMB_PX, camera: keyOfCam(core.state.cam, core.axes) });
+      thumbId = core.wire.ask({ type: "thumbs", of: "presets", names: thumbNames, size: THUMB_PX,
+        camera: keyOfCam(core.state.cam, core.axes) });
     }, 700);
   };
   core.wire.on("tile", async (t) => {
@@ -113,20 +115,26 @@ export function colourPanel(core, overlay) {
 
   // The selected point.
   const value = numberField({ label: "Value", onchange: (x) => moveSelected(x, null) });
-  const opacity = numberField({ label: "Opacity", min: 0, max: 1, step: 0.01, onchange: (a) => moveSelected(null, a) });
+  const opacity = numberField({ label: "Opacity", min: 0, max: 1, step: 0.01,
+    onchange: (a) => moveSelected(null, a) });
   const colour = h("input", { type: "color", oninput: () => recolour(true), onchange: () => recolour(false) });
-  const colourField = h("label", { class: "num" }, h("span", { text: "Colour" }), h("span", { class: "box" }, colour));
-  const remove = h("button", { type: "button", class: "quiet", title: "Remove the selected point (Delete)", "aria-label": "Remove the selected point", onclick: () => view.remove(view.selected.kind, view.selected.index) }, icon("bin"));
+  const colourField = h("label", { class: "num" }, h("span", { text: "Colour" }),
+    h("span", { class: "box" }, colour));
+  const remove = h("button", { type: "button", class: "quiet", title: "Remove the selected point (Delete)",
+    "aria-label": "Remove the selected point", onclick: () => view.remove(view.selected.kind, view.selected.index) },
+    icon("bin"));
   const which = h("span", { class: "which" });
   const moveSelected = (/** @type {number|null} */ x, /** @type {number|null} */ a) => {
     const { kind, index } = view.selected;
     const { tf } = core.state;
-    if (kind === "point") put(movedPoint(tf, index, x ?? tf.opacities[index][0], a ?? tf.opacities[index][1], range()), "");
+    if (kind === "point") put(movedPoint(tf, index, x ?? tf.opacities[index][0], a ?? tf.opacities[index][1],
+      range()), "");
     else if (x !== null) put(changedStop(tf, index, { x }, range()), "");
   };
   const recolour = (/** @type {boolean} */ moving) => {
     const { tf } = core.state;
-    if (view.selected.kind === "stop") core.change({ tf: changedStop(tf, view.selected.index, { hex: colour.value }, range()) }, "tf-colour", moving);
+    if (view.selected.kind === "stop") core.change({ tf: changedStop(tf, view.selected.index, { hex: colour.value },
+      range()) }, "tf-colour", moving);
   };
   const drawSelected = () => {
     if (!core.steps) return;
@@ -144,8 +152,10 @@ export function colourPanel(core, overlay) {
   };
 
   // Window.
-  const from = numberField({ label: "From", onchange: (a) => put(withWindow(core.state.tf, [a, Math.max(a, windowOf(core.state.tf)[1])], range()), "") });
-  const to = numberField({ label: "To", onchange: (b) => put(withWindow(core.state.tf, [Math.min(b, windowOf(core.state.tf)[0]), b], range()), "") });
+  const from = numberField({ label: "From", onchange: (a) => put(withWindow(core.state.tf,
+    [a, Math.max(a, windowOf(core.state.tf)[1])], range()), "") });
+  const to = numberField({ label: "To", onchange: (b) => put(withWindow(core.state.tf,
+    [Math.min(b, windowOf(core.state.tf)[0]), b], range()), "") });
 
   // Light.
   const light = segments("Light", [["key", "Key"], ["head", "Eye"], ["world", "World"], ["off", "Off"]], (v) => {
@@ -154,7 +164,8 @@ export function colourPanel(core, overlay) {
   });
   const lightFields = ["ambient", "diffuse", "specular", "power"].map((name) => {
     const field = numberField({
-      label: name[0].toUpperCase() + name.slice(1), min: 0, max: name === "power" ? 10000 : 10, step: name === "power" ? 1 : 0.05,
+      label: name[0].toUpperCase() + name.slice(1), min: 0, max: name === "power" ? 10000 : 10,
+        step: name === "power" ? 1 : 0.05,
       onchange: (x) => put(withLight(core.state.tf, { [name]: x }), ""),
     });
     return { name, ...field };
@@ -182,7 +193,8 @@ export function colourPanel(core, overlay) {
     drawPicked(m);
   });
   const drawPicked = (/** @type {any} */ m) => {
-    const close = h("button", { type: "button", class: "quiet", "aria-label": "Close", onclick: () => { picked.hidden = true; overlay.setMark(null); view.showPicked([]); } }, icon("close"));
+    const close = h("button", { type: "button", class: "quiet", "aria-label": "Close",
+      onclick: () => { picked.hidden = true; overlay.setMark(null); view.showPicked([]); } }, icon("close"));
     const rows = m.ranges.map((/** @type {any} */ r) => {
       const name = `${numberWords(r.from, 4)} to ${numberWords(r.to, 4)}`;
       const act = (/** @type {number} */ k) => () => put(emphasised(core.state.tf, r.from, r.to, k, range()), "");
@@ -198,7 +210,8 @@ export function colourPanel(core, overlay) {
       m.hit ? h("p", { text: `Surface at ${m.hit.map((/** @type {number} */ x) => numberWords(x, 4)).join(", ")} ${unit}, value ${numberWords(m.value, 4)}` })
         : h("p", { text: "Nothing stops the light here." }),
       rows.length ? h("ul", {}, ...rows) : null,
-      m.hit ? h("button", { type: "button", text: "Look at this point", onclick: () => aimAtPicked(core, m) }) : null);
+      m.hit ? h("button", { type: "button", text: "Look at this point",
+        onclick: () => aimAtPicked(core, m) }) : null);
     picked.hidden = false;
   };
 
@@ -229,31 +242,42 @@ export function colourPanel(core, overlay) {
   const drawTable = () => {
     if (!table.open || !core.steps) return;
     const { tf } = core.state;
-    syncRows(kept.point, pointRows, tf.opacities, (i) => pointRow(i), (row, [x, a]) => { row.x.set(x); row.a.set(a); });
-    syncRows(kept.stop, stopRows, tf.colors, (i) => stopRow(i), (row, p, i) => { row.x.set(p[0]); row.c.value = stopHex(tf, i); });
+    syncRows(kept.point, pointRows, tf.opacities, (i) => pointRow(i),
+      (row, [x, a]) => { row.x.set(x); row.a.set(a); });
+    syncRows(kept.stop, stopRows, tf.colors, (i) => stopRow(i),
+      (row, p, i) => { row.x.set(p[0]); row.c.value = stopHex(tf, i); });
   };
   const pointRow = (/** @type {number} */ i) => {
-    const x = numberField({ label: `Value of point ${i + 1}`, hidden: true, onchange: (v) => put(movedPoint(core.state.tf, i, v, core.state.tf.opacities[i][1], range()), "") });
-    const a = numberField({ label: `Opacity of point ${i + 1}`, hidden: true, min: 0, max: 1, step: 0.01, onchange: (v) => put(movedPoint(core.state.tf, i, core.state.tf.opacities[i][0], v, range()), "") });
-    const bin = h("button", { type: "button", class: "quiet", "aria-label": `Remove point ${i + 1}`, onclick: () => put(withoutPoint(core.state.tf, i), "") }, icon("bin"));
+    const x = numberField({ label: `Value of point ${i + 1}`, hidden: true,
+      onchange: (v) => put(movedPoint(core.state.tf, i, v, core.state.tf.opacities[i][1], range()), "") });
+    const a = numberField({ label: `Opacity of point ${i + 1}`, hidden: true, min: 0, max: 1, step: 0.01,
+      onchange: (v) => put(movedPoint(core.state.tf, i, core.state.tf.opacities[i][0], v, range()), "") });
+    const bin = h("button", { type: "button", class: "quiet", "aria-label": `Remove point ${i + 1}`,
+      onclick: () => put(withoutPoint(core.state.tf, i), "") }, icon("bin"));
     return { x, a, el: h("tr", {}, h("td", {}, x.el), h("td", {}, a.el), h("td", {}, bin)) };
   };
   const stopRow = (/** @type {number} */ i) => {
-    const x = numberField({ label: `Value of colour ${i + 1}`, hidden: true, onchange: (v) => put(changedStop(core.state.tf, i, { x: v }, range()), "") });
-    const c = h("input", { type: "color", "aria-label": `Colour ${i + 1}`, oninput: () => put(changedStop(core.state.tf, i, { hex: c.value }, range()), "tf-colour") });
-    const bin = h("button", { type: "button", class: "quiet", "aria-label": `Remove colour ${i + 1}`, onclick: () => put(withoutStop(core.state.tf, i), "") }, icon("bin"));
+    const x = numberField({ label: `Value of colour ${i + 1}`, hidden: true,
+      onchange: (v) => put(changedStop(core.state.tf, i, { x: v }, range()), "") });
+    const c = h("input", { type: "color", "aria-label": `Colour ${i + 1}`,
+      oninput: () => put(changedStop(core.state.tf, i, { hex: c.value }, range()), "tf-colour") });
+    const bin = h("button", { type: "button", class: "quiet", "aria-label": `Remove colour ${i + 1}`,
+      onclick: () => put(withoutStop(core.state.tf, i), "") }, icon("bin"));
     return { x, c, el: h("tr", {}, h("td", {}, x.el), h("td", {}, c), h("td", {}, bin)) };
   };
   const gradientPoints = [numberField({ label: "None below", min: 0, onchange: (g) => setGradient(g, null, null) }),
     numberField({ label: "All above", min: 0, onchange: (g) => setGradient(null, g, null) }),
-    numberField({ label: "Flat parts keep", min: 0, max: 1, step: 0.05, onchange: (f) => setGradient(null, null, f) })];
+    numberField({ label: "Flat parts keep", min: 0, max: 1, step: 0.05,
+      onchange: (f) => setGradient(null, null, f) })];
   const gradientOn = h("input", { type: "checkbox", onchange: () => {
     const most = mostGradient();
     const { gradient_opacity: _, ...rest } = core.state.tf;
-    put(gradientOn.checked ? { ...rest, gradient_opacity: [[round2(most * 0.05), 0], [round2(most * 0.3), 1]] } : rest, "");
+    put(gradientOn.checked ? { ...rest, gradient_opacity: [[round2(most * 0.05), 0],
+      [round2(most * 0.3), 1]] } : rest, "");
   } });
   const mostGradient = () => core.volume.gradients?.to ?? (range()[1] - range()[0]) / 2 / voxOf(core.volume);
-  const border = new BorderView((points, moving) => core.change({ tf: { ...core.state.tf, gradient_opacity: points } }, moving ? "tf-border" : "", moving), () => core.settle());
+  const border = new BorderView((points, moving) => core.change({ tf: { ...core.state.tf,
+    gradient_opacity: points } }, moving ? "tf-border" : "", moving), () => core.settle());
   const round2 = (/** @type {number} */ x) => Number(x.toPrecision(2));
   const setGradient = (/** @type {number|null} */ a, /** @type {number|null} */ b, /** @type {number|null} */ f) => {
     const points = core.state.tf.gradient_opacity ?? [[0, 0], [1, 1]];
@@ -261,7 +285,8 @@ export function colourPanel(core, overlay) {
     const lo = a ?? first[0];
     const hi = b ?? last[0];
     const inner = points.slice(1, -1).filter(([g]) => g > lo && g < hi);
-    put({ ...core.state.tf, gradient_opacity: [[Math.min(lo, hi), f ?? first[1]], ...inner, [Math.max(lo, hi), last[1]]] }, "");
+    put({ ...core.state.tf, gradient_opacity: [[Math.min(lo, hi), f ?? first[1]], ...inner,
+      [Math.max(lo, hi), last[1]]] }, "");
   };
   gradient.append(h("label", { class: "check" }, gradientOn, "Opaque at borders of materials alone"), border.el,
     h("div", { class: "fields three" }, ...gradientPoints.map((g) => g.el)));
@@ -275,7 +300,8 @@ export function colourPanel(core, overlay) {
       h("div", { class: "selected-row" }, which, remove),
       h("div", { class: "fields two" }, value.el, opacity.el, colourField),
       h("div", { class: "row" }, scale.el, axis.el, zoomTo)),
-    h("section", {}, h("header", {}, h("h2", { text: "Window" }), h("span", { class: "aside", text: "right-drag on the picture" })),
+    h("section", {}, h("header", {}, h("h2", { text: "Window" }),
+      h("span", { class: "aside", text: "right-drag on the picture" })),
       h("div", { class: "fields two" }, from.el, to.el)),
     h("section", {}, h("header", {}, h("h2", { text: "Light" })), light.el,
       directionRow, h("div", { class: "fields two" }, ...lightFields.map((f) => f.el))),
@@ -323,7 +349,8 @@ export function colourPanel(core, overlay) {
 }
 
 /** @param {...string} names */
-const head = (...names) => h("thead", {}, h("tr", {}, ...names.map((n) => h("th", { scope: "col", text: n })), h("td", {})));
+const head = (...names) => h("thead", {}, h("tr", {}, ...names.map((n) => h("th", { scope: "col", text: n })),
+  h("td", {})));
 
 /**
  * Makes as many rows as there are entries and fills them.

@@ -110,7 +110,8 @@ export class Core extends Signals {
       this.openVolume(doc.volume.name);
       return;
     }
-    try { this.adopt(stateOfDocument(doc, this.volume), ""); } catch (e) { this.note("warning", /** @type {Error} */ (e).message); }
+    try { this.adopt(stateOfDocument(doc, this.volume), ""); } catch (e) { this.note("warning",
+      /** @type {Error} */ (e).message); }
   }
 
   hello() {

@@ -19,7 +19,8 @@ export function cutPanel(core, overlay) {
     const title = h("h2");
     const note = h("span", { class: "aside" });
     const ends = [0, 1].map((side) => {
-      const field = numberField({ label: side ? "To" : "From", onchange: (x) => move(axis, /** @type {0|1} */ (side), x, false) });
+      const field = numberField({ label: side ? "To" : "From",
+        onchange: (x) => move(axis, /** @type {0|1} */ (side), x, false) });
       const slider = h("input", {
         type: "range", min: 0, max: 1000, step: 1,
         oninput: () => {
@@ -32,7 +33,8 @@ export function cutPanel(core, overlay) {
     });
     const fill = h("span", { class: "fill" });
     const pair = h("div", { class: "range-pair" }, fill, ends[0].slider, ends[1].slider);
-    const el = h("section", {}, h("header", {}, title, note), pair, h("div", { class: "fields two" }, ends[0].field.el, ends[1].field.el));
+    const el = h("section", {}, h("header", {}, title, note), pair,
+      h("div", { class: "fields two" }, ends[0].field.el, ends[1].field.el));
     return { axis, title, note, ends, fill, el };
   });
   /**
@@ -44,7 +46,8 @@ export function cutPanel(core, overlay) {
   const move = (axis, side, x, moving) =>
     core.change({ crop: cropWith(core.state.crop, axis, side, x, core.volume.box) }, `crop${axis}${side}`, moving);
   const show = h("input", { type: "checkbox", checked: true, onchange: () => overlay.setBox(show.checked) });
-  const reset = h("button", { type: "button", text: "Whole volume", onclick: () => core.change({ crop: noCrop() }, "") });
+  const reset = h("button", { type: "button", text: "Whole volume",
+    onclick: () => core.change({ crop: noCrop() }, "") });
   const halves = h("div", { class: "sides" });
   const el = h("div", {},
     h("section", {}, h("header", {}, h("h2", { text: "Cut open" }), reset),
@@ -58,7 +61,8 @@ export function cutPanel(core, overlay) {
       const [plus, minus] = letters[row.axis];
       const words = volume.anatomical ? `${NAMES[minus]} to ${NAMES[plus]}` : `${"xyz"[row.axis]} axis`;
       row.title.textContent = words[0].toUpperCase() + words.slice(1);
-      row.ends.forEach((/** @type {any} */ end, /** @type {number} */ side) => setAttr(end.slider, "aria-label", `${words}, ${side ? "to" : "from"}`));
+      row.ends.forEach((/** @type {any} */ end, /** @type {number} */ side) => setAttr(end.slider, "aria-label",
+        `${words}, ${side ? "to" : "from"}`));
     });
     halves.replaceChildren(...[0, 1, 2].map((axis) => {
       const side = core.axes.front[axis] || core.axes.up[axis] ? 1 : 0;
@@ -66,7 +70,8 @@ export function cutPanel(core, overlay) {
       const name = volume.anatomical ? `${NAMES[letters[axis][positive ? 0 : 1]]} half off` : `half of ${"xyz"[axis]} off`;
       return h("button", { type: "button", text: name[0].toUpperCase() + name.slice(1), onclick: () => {
         const middle = (volume.box[0][axis] + volume.box[1][axis]) / 2;
-        core.change({ crop: cropWith(core.state.crop, axis, /** @type {0|1} */ (positive ? 1 : 0), middle, volume.box) }, "");
+        core.change({ crop: cropWith(core.state.crop, axis, /** @type {0|1} */ (positive ? 1 : 0), middle,
+          volume.box) }, "");
       } });
     }));
   });

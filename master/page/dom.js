@@ -134,7 +134,8 @@ export function numberField({ label, unit = "", min, max, step = 1, hidden = fal
  */
 export function segments(label, choices, onchange) {
   const buttons = choices.map(([value, text]) =>
-    h("button", { type: "button", "data-value": value, "aria-pressed": "false", text, onclick: () => onchange(value) }));
+    h("button", { type: "button", "data-value": value, "aria-pressed": "false", text,
+      onclick: () => onchange(value) }));
   const el = h("div", { class: "segments", role: "group", "aria-label": label }, ...buttons);
   return {
     el,

@@ -128,7 +128,8 @@ export function listenToHands(stage, core) {
       const span = range[1] - range[0];
       const level = (a + b) / 2 + alongX * span * 0.5;
       const width = clamp((b - a || span / 100) * 4 ** (2 * alongY), span / 1000, 2 * span);
-      core.change({ tf: withWindow(gesture.tf, [level - width / 2, level + width / 2], core.volume.range) }, "hand-tf", true);
+      core.change({ tf: withWindow(gesture.tf, [level - width / 2, level + width / 2], core.volume.range) },
+        "hand-tf", true);
     }
   });
 

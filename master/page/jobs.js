@@ -8,7 +8,8 @@ import { decodeTile } from "./wire.js";
 /** @typedef {import("./core.js").Core} Core */
 
 const STATES = {
-  queued: "waiting", preparing: "cutting bricks", waiting: "no worker", running: "drawing", done: "done", failed: "failed", cancelled: "cancelled",
+  queued: "waiting", preparing: "cutting bricks", waiting: "no worker", running: "drawing", done: "done",
+    failed: "failed", cancelled: "cancelled",
 };
 const OPEN = ["queued", "preparing", "waiting", "running"];
 
@@ -45,10 +46,13 @@ export function jobsPanel(core, announce) {
       row.words = h("span", { class: "dim" });
       row.bar = h("progress", { max: 1, "aria-label": "Progress" });
       row.count = h("span", { class: "count" });
-      row.cancel = h("button", { type: "button", class: "quiet", onclick: () => core.wire.ask({ type: "cancel_job", job: row.job }) }, icon("close"));
-      row.save = h("button", { type: "button", class: "quiet", onclick: () => saveResult(known.get(row.job)) }, icon("save"));
+      row.cancel = h("button", { type: "button", class: "quiet",
+        onclick: () => core.wire.ask({ type: "cancel_job", job: row.job }) }, icon("close"));
+      row.save = h("button", { type: "button", class: "quiet", onclick: () => saveResult(known.get(row.job)) },
+        icon("save"));
       row.el = h("div", { class: "row-item job" }, row.canvas,
-        h("div", { class: "line" }, row.name, row.state), h("div", { class: "line" }, row.bar), h("div", { class: "line" }, row.words, row.count), h("div", { class: "act" }, row.save, row.cancel));
+        h("div", { class: "line" }, row.name, row.state), h("div", { class: "line" }, row.bar),
+          h("div", { class: "line" }, row.words, row.count), h("div", { class: "act" }, row.save, row.cancel));
       return row;
     },
     fill: (row, job) => {
@@ -82,13 +86,15 @@ export function jobsPanel(core, announce) {
       download(await answer.blob(), job.result.name);
     } catch (e) { core.note("error", `The result could not be fetched. ${/** @type {Error} */ (e).message}`); }
   };
-  const search = h("input", { type: "search", placeholder: "Find a job", "aria-label": "Find a job", oninput: () => draw() });
+  const search = h("input", { type: "search", placeholder: "Find a job", "aria-label": "Find a job",
+    oninput: () => draw() });
   const count = h("span", { class: "aside" });
   const older = h("button", { type: "button", class: "link", text: "Older", onclick: () => {
     const last = sorted().at(-1);
     if (last) core.wire.ask({ type: "jobs_page", before: last.job, count: 1000 });
   } });
-  const el = h("div", { class: "list-panel" }, h("header", {}, h("h2", { text: "Jobs" }), count, older), search, rows.el);
+  const el = h("div", { class: "list-panel" }, h("header", {}, h("h2", { text: "Jobs" }), count, older), search,
+    rows.el);
   const sorted = () => [...known.values()].sort((a, b) => b.submitted_ms - a.submitted_ms);
   function draw() {
     const words = search.value.trim().toLowerCase();

@@ -12,24 +12,30 @@ export const KEY_LIST = [
   ["Picture", [
     ["drag", "turn"], ["Shift drag, middle drag", "move"], ["wheel, pinch", "zoom at the pointer"],
     ["click", "values behind the pixel"], ["double click", "look at this point"],
-    ["right drag", "window and level"], ["Ctrl right drag", "more or less opaque"], ["two fingers", "move, zoom and lean"],
+    ["right drag", "window and level"], ["Ctrl right drag", "more or less opaque"],
+      ["two fingers", "move, zoom and lean"],
   ]],
   ["Curve", [
     ["press", "add a point"], ["drag", "move it (Shift: one way)"], ["right or double click", "remove it"],
-    ["Alt drag", "move the whole curve"], ["double click on the strip", "add a colour"], ["wheel", "zoom along values"],
+    ["Alt drag", "move the whole curve"], ["double click on the strip", "add a colour"],
+      ["wheel", "zoom along values"],
   ]],
   ["Keys", [
     ["← → ↑ ↓", "turn by 5° (Shift: 1°)"], ["Alt with arrows", "move"], ["+ −", "zoom"], ["[ ]", "lean by 5°"],
-    ["1 to 6", "front, back, left, right, above, below"], ["P", "perspective or parallel"], ["F", "fit what is seen"], ["R", "first view"],
-    ["T X V K", "colour, cut, view, save"], ["D J W O", "details, jobs, workers, volumes"], ["H", "hide or show the panel"],
-    ["I", "values behind the middle"], ["S", "save the picture"], ["C", "copy the link"], ["Z, Shift Z", "undo, redo"], ["Space", "turn by itself"], ["?", "this list"],
+    ["1 to 6", "front, back, left, right, above, below"], ["P", "perspective or parallel"], ["F", "fit what is seen"],
+      ["R", "first view"],
+    ["T X V K", "colour, cut, view, save"], ["D J W O", "details, jobs, workers, volumes"],
+      ["H", "hide or show the panel"],
+    ["I", "values behind the middle"], ["S", "save the picture"], ["C", "copy the link"],
+      ["Z, Shift Z", "undo, redo"], ["Space", "turn by itself"], ["?", "this list"],
   ]],
 ];
 
 /** @param {any} dialog */
 export function fillHelp(dialog) {
   const parts = KEY_LIST.map(([title, rows]) => h("section", {}, h("h3", { text: title }),
-    h("dl", { class: "key-list" }, .../** @type {string[][]} */ (/** @type {any} */ (rows)).flatMap(([key, what]) => [h("dt", { text: key }), h("dd", { text: what })]))));
+    h("dl", { class: "key-list" }, .../** @type {string[][]} */ (/** @type {any} */ (rows)).flatMap(([key,
+      what]) => [h("dt", { text: key }), h("dd", { text: what })]))));
   dialog.querySelector(".help-body").replaceChildren(...parts);
 }
 
@@ -84,7 +90,8 @@ function run(acts, e) {
 function cameraKey(core, e) {
   const { cam } = core.state;
   const o = core.axes;
-  const put = (/** @type {any} */ next, /** @type {string} */ tag) => { core.change({ cam: next }, tag, true); return true; };
+  const put = (/** @type {any} */ next, /** @type {string} */ tag) => { core.change({ cam: next }, tag,
+    true); return true; };
   const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[e.key];
   if (by && e.altKey) return put(pannedBy(cam, o, by[0] * MOVE, by[1] * MOVE, 1), "key-move");
   if (by) {
@@ -92,7 +99,8 @@ function cameraKey(core, e) {
     return put(steppedBy(cam, o, by[0] * step, by[1] * step), "key-turn");
   }
   if (e.altKey) return false;
-  if (e.key === "+" || e.key === "=") return put(zoomedAt(cam, o, 1 / 1.2, 0, 0, 1, heightLimits(core.volume)), "key-zoom");
+  if (e.key === "+" || e.key === "=") return put(zoomedAt(cam, o, 1 / 1.2, 0, 0, 1, heightLimits(core.volume)),
+    "key-zoom");
   if (e.key === "-") return put(zoomedAt(cam, o, 1.2, 0, 0, 1, heightLimits(core.volume)), "key-zoom");
   if (e.key === "[") return put(rolledBy(cam, -TURN), "key-lean");
   if (e.key === "]") return put(rolledBy(cam, TURN), "key-lean");
@@ -100,6 +108,7 @@ function cameraKey(core, e) {
     lookFrom(core, SIDES[Number(e.key) - 1]);
     return true;
   }
-  if (e.key.toLowerCase() === "p") return put({ ...cam, projection: cam.projection === "ortho" ? "persp" : "ortho" }, "");
+  if (e.key.toLowerCase() === "p") return put({ ...cam, projection: cam.projection === "ortho" ? "persp" : "ortho" },
+    "");
   return false;
 }

@@ -84,13 +84,16 @@ orient();
 const notes = byId("notes");
 core.on("note", ({ level, text, id }) => {
   for (const old of notes.children) if (old.dataset.text === text) old.remove();
-  const close = h("button", { type: "button", class: "quiet", "aria-label": "Close this note", onclick: () => note.remove() }, icon("close"));
-  const note = h("div", { class: `note ${level}`, role: level === "error" ? "alert" : null, "data-text": text, "data-id": id ?? null }, h("p", { text }), close);
+  const close = h("button", { type: "button", class: "quiet", "aria-label": "Close this note",
+    onclick: () => note.remove() }, icon("close"));
+  const note = h("div", { class: `note ${level}`, role: level === "error" ? "alert" : null, "data-text": text,
+    "data-id": id ?? null }, h("p", { text }), close);
   notes.append(note);
   while (notes.children.length > 3) notes.firstChild.remove();
   if (level === "info" && !id) setTimeout(() => note.remove(), 6000);
 });
-core.wire.on("notice", (m) => core.emit("note", { level: m.level, text: `${m.text} ${m.remedy ?? ""}`.trim(), id: m.until === "over" ? m.id : undefined }));
+core.wire.on("notice", (m) => core.emit("note", { level: m.level, text: `${m.text} ${m.remedy ?? ""}`.trim(),
+  id: m.until === "over" ? m.id : undefined }));
 core.wire.on("notice_over", (m) => { for (const n of [...notes.children]) if (n.dataset.id === String(m.id)) n.remove(); });
 
 // Connection.
@@ -177,7 +180,8 @@ listenToKeys(core, {
   d: () => openTab("shown"), j: () => openTab("jobs"), w: () => openTab("workers"), o: () => openTab("volumes"),
   h: () => openTab(open || lastOpen), f: () => fitView(core), r: () => core.emit("reset"),
   s: () => { savePicture(core, core.size, "png", false); }, c: () => { copyAddress(core); },
-  z: () => core.step("undo"), "z+shift": () => core.step("redo"), i: () => pickAt(core, core.size[0] >> 1, core.size[1] >> 1, false), Space: toggleSpin, "?": showHelp,
+  z: () => core.step("undo"), "z+shift": () => core.step("redo"),
+    i: () => pickAt(core, core.size[0] >> 1, core.size[1] >> 1, false), Space: toggleSpin, "?": showHelp,
 });
 let lastOpen = "colour";
 tablist.addEventListener("click", () => { if (open) lastOpen = open; });

@@ -71,7 +71,8 @@ export class Overlay {
       const { volume, state } = this.core;
       const pxPerMm = this.rect().height / state.cam.height;
       const by = dragAlong(e.clientX - drag.x, e.clientY - drag.y, drag.ax, drag.ay, pxPerMm);
-      this.core.change({ crop: cropWith(state.crop, axis, side, drag.from + by, volume.box) }, `crop${axis}${side}`, true);
+      this.core.change({ crop: cropWith(state.crop, axis, side, drag.from + by, volume.box) }, `crop${axis}${side}`,
+        true);
     });
     const end = () => {
       if (drag) this.core.settle();
@@ -122,7 +123,8 @@ export class Overlay {
     root.classList.toggle("on-light", lightness(state.background) > 0.5);
     const k = uiScale();
     const names = edgeLetters(state.cam, axes, volume.anatomical);
-    const places = { top: [width / 2, 18 * k], bottom: [width / 2, height - 10 * k], left: [12 * k, height / 2 + 5], right: [width - 12 * k, height / 2 + 5] };
+    const places = { top: [width / 2, 18 * k], bottom: [width / 2, height - 10 * k], left: [12 * k, height / 2 + 5],
+      right: [width - 12 * k, height / 2 + 5] };
     for (const [side, [x, y]] of Object.entries(places)) {
       const el = this.letters[side];
       el.textContent = /** @type {any} */ (names)[side];
@@ -180,9 +182,11 @@ export class Overlay {
           flat(/** @type {Vec3} */ (n.map((x, i) => x + a * u[i] + b * v[i]))).map((x) => x.toFixed(1)).join(" ");
         const [tx, ty] = flat(n);
         const face = svg("g", { class: "cube-face", "data-handle": "" },
-          svg("path", { d: `M${corner(-1, -1)}L${corner(1, -1)}L${corner(1, 1)}L${corner(-1, 1)}z`, "fill-opacity": (0.15 + 0.35 * facing).toFixed(2) }));
+          svg("path", { d: `M${corner(-1, -1)}L${corner(1, -1)}L${corner(1, 1)}L${corner(-1, 1)}z`,
+            "fill-opacity": (0.15 + 0.35 * facing).toFixed(2) }));
         if (facing > 0.35) {
-          face.append(svg("text", { x: tx.toFixed(1), y: (ty + 4 * k).toFixed(1), text: letters[axis][sign > 0 ? 0 : 1], opacity: Math.min(1, facing * 1.4).toFixed(2) }));
+          face.append(svg("text", { x: tx.toFixed(1), y: (ty + 4 * k).toFixed(1),
+            text: letters[axis][sign > 0 ? 0 : 1], opacity: Math.min(1, facing * 1.4).toFixed(2) }));
         }
         face.addEventListener("pointerdown", (/** @type {Event} */ e) => e.stopPropagation());
         face.addEventListener("click", () => this.turnTo(n));

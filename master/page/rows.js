@@ -25,7 +25,8 @@ export class Rows {
     this.spare = [];
     this.spacer = h("div", { class: "rows-space", role: "list", "aria-label": label });
     this.empty = h("p", { class: "hint", text: empty });
-    this.scroller = h("div", { class: "rows", tabindex: 0, role: "group", "aria-label": label, onscroll: () => this.draw() }, this.empty, this.spacer);
+    this.scroller = h("div", { class: "rows", tabindex: 0, role: "group", "aria-label": label,
+      onscroll: () => this.draw() }, this.empty, this.spacer);
     this.el = this.scroller;
     new ResizeObserver(() => this.draw()).observe(this.scroller);
   }

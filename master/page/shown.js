@@ -10,7 +10,8 @@ const LATE_MS = 200;
 /** Words for sources of error, as in docs/reference/statistics.md. */
 const SOURCES = {
   cutoff: "pixels shut early", quantisation: "colours in 8 bits", accumulation: "sums in 16 bits",
-  rounding: "places on the grid", truncation: "kernel's end", thickness: "thickness of sheets", ripple: "ripple of the kernel",
+  rounding: "places on the grid", truncation: "kernel's end", thickness: "thickness of sheets",
+    ripple: "ripple of the kernel",
 };
 
 /**
@@ -38,9 +39,13 @@ export function shownPanel(core, strip) {
   const left = h("ul", { class: "plain" });
   const el = h("div", {},
     h("section", {}, h("header", {}, h("h2", { text: "This picture" })), facts),
-    h("section", {}, h("header", {}, h("h2", { text: "How far it may be off" }), h("span", { class: "aside", text: "in 1/255" })),
-      h("table", { class: "numbers" }, h("thead", {}, h("tr", {}, h("th", { scope: "col", text: "Source" }), h("th", { scope: "col", text: "Off" }), h("th", { scope: "col", text: "Kind" }))), errors), noErrors),
-    h("section", {}, h("header", {}, h("h2", { text: "Left out" }), h("span", { class: "aside", text: "this scene does not need it" })), left));
+    h("section", {}, h("header", {}, h("h2", { text: "How far it may be off" }),
+      h("span", { class: "aside", text: "in 1/255" })),
+      h("table", { class: "numbers" }, h("thead", {},
+        h("tr", {}, h("th", { scope: "col", text: "Source" }), h("th", { scope: "col", text: "Off" }),
+        h("th", { scope: "col", text: "Kind" }))), errors), noErrors),
+    h("section", {}, h("header", {}, h("h2", { text: "Left out" }),
+      h("span", { class: "aside", text: "this scene does not need it" })), left));
   let hash = /** @type {any} */ (null);
   /** @type {any} */
   let last = null;
@@ -70,15 +75,19 @@ export function shownPanel(core, strip) {
       ["Pixels of the file", last.sha256 ?? "–"],
       ["View", last.view_sha256 ?? "–"],
     ];
-    facts.replaceChildren(...rows.flatMap(([name, value]) => [h("dt", { text: name }), h("dd", { text: value, class: /^[0-9a-f]{64}$/.test(value) ? "hash" : null })]));
+    facts.replaceChildren(...rows.flatMap(([name, value]) => [h("dt", { text: name }),
+      h("dd", { text: value, class: /^[0-9a-f]{64}$/.test(value) ? "hash" : null })]));
     const found = Object.entries(last.error ?? {});
     errors.replaceChildren(...found.map(([name, e]) => h("tr", {},
       h("th", { scope: "row", text: /** @type {any} */ (SOURCES)[name] ?? name }),
-      h("td", { text: e ? Number(/** @type {any} */ (e).value.toPrecision(2)) : "–" }), h("td", { text: e ? /** @type {any} */ (e).kind : "not measured" }))));
+      h("td", { text: e ? Number(/** @type {any} */ (e).value.toPrecision(2)) : "–" }),
+        h("td", { text: e ? /** @type {any} */ (e).kind : "not measured" }))));
     noErrors.hidden = found.length > 0;
     setText(noErrors, still ? "Nobody measured it for this picture." : "It is measured when the picture is at rest.");
     left.replaceChildren(...((last.left_out ?? []).length ? last.left_out.map((/** @type {any} */ x) =>
-      h("li", {}, h("span", { text: x.name }), h("b", { text: [x.saved_ms != null && `${x.saved_ms.toFixed(1)} ms`, x.saved_bytes && bytesWords(x.saved_bytes)].filter(Boolean).join(", ") })))
+      h("li", {}, h("span", { text: x.name }), h("b",
+        { text: [x.saved_ms != null && `${x.saved_ms.toFixed(1)} ms`,
+        x.saved_bytes && bytesWords(x.saved_bytes)].filter(Boolean).join(", ") })))
       : [h("li", { text: "Nothing." })]));
   };
   /** @type {any} */

@@ -129,7 +129,8 @@ export class TfView {
       const index = Number(target?.dataset.index ?? 0);
       const at = this.at(e);
       // Points are made anew as they are drawn, so that the browser sees no double click on one.
-      const twice = e.timeStamp - last.time < 350 && last.kind === kind && Math.hypot(at.u - last.u, at.v - last.v) < 6;
+      const twice = e.timeStamp - last.time < 350 && last.kind === kind && Math.hypot(at.u - last.u,
+        at.v - last.v) < 6;
       last = { time: twice ? 0 : e.timeStamp, kind, u: at.u, v: at.v };
       if (twice && (kind === "point" || kind === "stop")) {
         drag = null;
@@ -173,7 +174,8 @@ export class TfView {
         const to = e.shiftKey && alongX ? a0 : opacityOf(y, this.stretched);
         this.put(movedPoint(drag.tf, drag.index, x, to, this.range), "tf-point", true);
       } else if (drag.kind === "stop") {
-        this.put(changedStop(drag.tf, drag.index, { x: drag.tf.colors[drag.index][0] + dx }, this.range), "tf-stop", true);
+        this.put(changedStop(drag.tf, drag.index, { x: drag.tf.colors[drag.index][0] + dx }, this.range), "tf-stop",
+          true);
       } else if (drag.kind === "from") {
         this.put(withWindow(drag.tf, [Math.min(a + dx, b), b], this.range), "tf-window", true);
       } else if (drag.kind === "to") {
@@ -252,7 +254,8 @@ export class TfView {
     else if (e.key === "Insert") {
       const next = list[i + 1]?.[0] ?? hi;
       const x = (list[i][0] + next) / 2;
-      const [tf, made] = kind === "point" ? withPoint(this.tf, x, opacityAt(this.tf, x), this.range) : withStop(this.tf, x, this.range);
+      const [tf, made] = kind === "point" ? withPoint(this.tf, x, opacityAt(this.tf, x),
+        this.range) : withStop(this.tf, x, this.range);
       this.put(tf, "", false);
       this.select(kind, made);
     } else return;
@@ -336,7 +339,8 @@ export class TfView {
     });
     const [lo, hi] = this.span;
     const columns = [0, 0.25, 0.5, 0.75, 1].map((t) => svg("text", {
-      x: EDGE.left + t * this.plotWidth, y: bottom + 38, "text-anchor": t === 0 ? "start" : t === 1 ? "end" : "middle",
+      x: EDGE.left + t * this.plotWidth, y: bottom + 38,
+        "text-anchor": t === 0 ? "start" : t === 1 ? "end" : "middle",
       text: numberWords(roundValue(lo + t * (hi - lo), this.range), 5),
     }));
     this.grid.replaceChildren(...rows, ...columns);
@@ -344,20 +348,23 @@ export class TfView {
 
   drawWindow() {
     const [a, b] = windowOf(this.tf).map((x) => clamp(this.px(x), EDGE.left, EDGE.left + this.plotWidth));
-    const grip = (/** @type {number} */ x, /** @type {string} */ kind) => svg("g", { "data-kind": kind, class: "grip" },
+    const grip = (/** @type {number} */ x, /** @type {string} */ kind) => svg("g",
+      { "data-kind": kind, class: "grip" },
       svg("path", { d: `M${x.toFixed(1)} ${EDGE.top - 8}V${this.bottom}` }),
       svg("path", { class: "cap", d: `M${(x - 5).toFixed(1)} ${EDGE.top - 14}h10v6l-5 5l-5-5z` }),
       svg("rect", { x: x - 9, y: 0, width: 18, height: EDGE.top, class: "hit" }));
     this.window.replaceChildren(
       svg("g", { "data-kind": "level", class: "level" },
         svg("path", { d: `M${a.toFixed(1)} ${EDGE.top - 11}H${b.toFixed(1)}` }),
-        svg("rect", { x: Math.min(a, b), y: 0, width: Math.max(Math.abs(b - a), 1), height: EDGE.top, class: "hit" })),
+        svg("rect", { x: Math.min(a, b), y: 0, width: Math.max(Math.abs(b - a), 1), height: EDGE.top,
+          class: "hit" })),
       grip(a, "from"), grip(b, "to"));
   }
 
   drawStops() {
     const y = this.bottom + 5;
-    for (const [name, value] of Object.entries({ x: EDGE.left, y, width: this.plotWidth, height: EDGE.strip })) setAttr(this.strip, name, value);
+    for (const [name, value] of Object.entries({ x: EDGE.left, y, width: this.plotWidth,
+      height: EDGE.strip })) setAttr(this.strip, name, value);
     const [lo, hi] = this.span;
     this.stops.replaceChildren(...this.tf.colors.map(([x], i) => {
       const on = this.selected.kind === "stop" && this.selected.index === i;

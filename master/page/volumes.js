@@ -22,8 +22,11 @@ export function volumesPanel(core, announce) {
       const row = /** @type {any} */ ({});
       row.name = h("b");
       row.words = h("span", { class: "dim" });
-      row.open = h("button", { type: "button", class: "row-open", onclick: () => { if (!row.problem) core.openVolume(row.volume); } }, h("span", { class: "line" }, row.name), h("span", { class: "line" }, row.words));
-      row.remove = h("button", { type: "button", class: "quiet", onclick: () => core.wire.ask({ type: "remove_volume", volume: row.volume }) }, icon("bin"));
+      row.open = h("button", { type: "button", class: "row-open",
+        onclick: () => { if (!row.problem) core.openVolume(row.volume); } }, h("span", { class: "line" }, row.name),
+        h("span", { class: "line" }, row.words));
+      row.remove = h("button", { type: "button", class: "quiet",
+        onclick: () => core.wire.ask({ type: "remove_volume", volume: row.volume }) }, icon("bin"));
       row.el = h("div", { class: "row-item volume" }, row.open, h("div", { class: "act" }, row.remove));
       return row;
     },
@@ -31,7 +34,8 @@ export function volumesPanel(core, announce) {
       row.volume = v.name;
       setText(row.name, v.name);
       const shape = v.dims?.length ? `${v.dims.join(" × ")} ${v.sample_kind}` : "not read yet";
-      setText(row.words, v.problem || [shape, v.bytes ? bytesWords(v.bytes) : "", v.in_memory ? "in memory" : ""].filter(Boolean).join(" · "));
+      setText(row.words, v.problem || [shape, v.bytes ? bytesWords(v.bytes) : "",
+        v.in_memory ? "in memory" : ""].filter(Boolean).join(" · "));
       setAttr(row.words, "title", row.words.textContent);
       row.words.classList.toggle("bad", !!v.problem);
       setAttr(row.open, "aria-current", v.name === core.volume?.name ? "true" : null);
@@ -41,12 +45,15 @@ export function volumesPanel(core, announce) {
       setAttr(row.remove, "aria-label", `Remove ${v.name}`);
     },
   });
-  const input = h("input", { type: "file", multiple: true, class: "away", tabindex: -1, "aria-hidden": "true", onchange: () => { begin([...input.files]); input.value = ""; } });
+  const input = h("input", { type: "file", multiple: true, class: "away", tabindex: -1, "aria-hidden": "true",
+    onchange: () => { begin([...input.files]); input.value = ""; } });
   const pick = h("button", { type: "button", text: "Choose files…", onclick: () => input.click() });
-  const zone = h("div", { class: "drop-zone" }, h("p", { text: "Drop a file or a DICOM folder anywhere on the page." }), pick, input);
+  const zone = h("div", { class: "drop-zone" }, h("p",
+    { text: "Drop a file or a DICOM folder anywhere on the page." }), pick, input);
   const uploads = h("div", { class: "uploads" });
   const count = h("span", { class: "aside" });
-  const el = h("div", { class: "list-panel" }, h("header", {}, h("h2", { text: "Volumes" }), count), zone, uploads, rows.el);
+  const el = h("div", { class: "list-panel" }, h("header", {}, h("h2", { text: "Volumes" }), count), zone, uploads,
+    rows.el);
   const draw = () => {
     setText(count, `${known.size}`);
     rows.set([...known.values()].sort((a, b) => a.name.localeCompare(b.name)));
@@ -65,7 +72,8 @@ export function volumesPanel(core, announce) {
     const abort = new AbortController();
     const bar = h("progress", { max: 1, "aria-label": `Upload of ${name}` });
     const words = h("span", { class: "dim" });
-    const stop = h("button", { type: "button", class: "quiet", "aria-label": `Stop the upload of ${name}`, onclick: () => { abort.abort(); item.remove(); } }, icon("close"));
+    const stop = h("button", { type: "button", class: "quiet", "aria-label": `Stop the upload of ${name}`,
+      onclick: () => { abort.abort(); item.remove(); } }, icon("close"));
     const item = h("div", { class: "upload" }, h("div", { class: "line" }, h("b", { text: name }), stop), bar, words);
     uploads.append(item);
     upload(core, name, files, abort.signal, (done, all) => {
@@ -110,8 +118,10 @@ async function upload(core, name, files, signal, progress) {
     for (let tries = 0; at < file.size;) {
       const body = file.slice(at, at + chunk);
       try {
-        const answer = await fetch(`v1/uploads/${id}/${i}?offset=${at}`, { method: "PUT", body, signal, headers: core.headers });
-        if (!answer.ok && answer.status !== 409) throw Object.assign(new Error(await refusalWords(answer)), { final: answer.status < 500 });
+        const answer = await fetch(`v1/uploads/${id}/${i}?offset=${at}`,
+          { method: "PUT", body, signal, headers: core.headers });
+        if (!answer.ok && answer.status !== 409) throw Object.assign(new Error(await refusalWords(answer)),
+          { final: answer.status < 500 });
         const { received: got } = await answer.json();
         done += got - at;
         at = got;

@@ -22,7 +22,8 @@ export function workersPanel(core) {
       row.memoryWords = h("span", { class: "count" });
       row.words = h("span", { class: "dim" });
       row.el = h("div", { class: "row-item worker" }, h("div", { class: "line" }, row.name, row.state),
-        h("div", { class: "meters" }, h("span", { class: "dim", text: "Threads" }), row.busy, row.busyWords, h("span", { class: "dim", text: "Memory" }), row.memory, row.memoryWords),
+        h("div", { class: "meters" }, h("span", { class: "dim", text: "Threads" }), row.busy, row.busyWords,
+          h("span", { class: "dim", text: "Memory" }), row.memory, row.memoryWords),
         h("div", { class: "line" }, row.words));
       return row;
     },
@@ -38,7 +39,9 @@ export function workersPanel(core) {
       row.memory.value = w.held_bytes;
       setText(row.memoryWords, bytesWords(w.held_bytes));
       const error = w.last_error ? `last error ${durationWords(now() - w.last_error.at_ms)} ago: ${w.last_error.text}` : "";
-      setText(row.words, [w.address || "in this process", w.rtt_ms != null && `${w.rtt_ms.toFixed(1)} ms`, w.damaged ? `${w.damaged} damaged` : "", `since ${durationWords(now() - w.joined_ms)}`, error].filter(Boolean).join(" · "));
+      setText(row.words, [w.address || "in this process", w.rtt_ms != null && `${w.rtt_ms.toFixed(1)} ms`,
+        w.damaged ? `${w.damaged} damaged` : "", `since ${durationWords(now() - w.joined_ms)}`,
+        error].filter(Boolean).join(" · "));
       setAttr(row.words, "title", `${row.words.textContent} · ${w.simd} · ${w.tasks_done} tasks · holds ${bytesWords(w.held_bytes)} of ${bytesWords(w.memory_bytes)}`);
       row.words.classList.toggle("bad", !!w.last_error);
     },

@@ -110,8 +110,11 @@ export class Core extends Signals {
       this.openVolume(doc.volume.name);
       return;
     }
-    try { this.adopt(stateOfDocument(doc, this.volume), ""); } catch (e) { this.note("warning",
-      /** @type {Error} */ (e).message); }
+    try {
+      this.adopt(stateOfDocument(doc, this.volume), "");
+    } catch (e) {
+      this.note("warning", /** @type {Error} */ (e).message);
+    }
   }
 
   hello() {
@@ -129,7 +132,7 @@ export class Core extends Signals {
       const frames = doc.path?.keyframes ?? {};
       Object.assign(message, {
         volume: doc.volume?.name,
-        view: { seq: ++this.seq, camera: frames.keys?.[0], size: this.size, moving: false },
+        ...(frames.keys?.[0] && { view: { seq: ++this.seq, camera: frames.keys[0], size: this.size, moving: false } }),
         scene: {
           rev: ++this.rev, tf: doc.tf, crop: doc.path?.crop ?? null, background: doc.background,
           quality: doc.quality, up: frames.up ?? null, front: frames.front ?? null, moving: false,
@@ -149,6 +152,9 @@ export class Core extends Signals {
       let first = homeState(volume);
       if (this.wanted) {
         try {
+          if (this.wanted.volume?.name !== volume.name) {
+            throw new Error(`This master has no volume named ${this.wanted.volume?.name}. This is ${volume.name}.`);
+          }
           first = stateOfDocument(this.wanted, volume);
           if (this.wanted.volume?.digest && this.wanted.volume.digest !== volume.digest) {
             this.note("warning", `The address was made for another volume of the name ${volume.name}.`);

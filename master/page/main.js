@@ -108,7 +108,16 @@ core.on("status", (s) => {
 // Picture.
 byId("undo").addEventListener("click", () => core.step("undo"));
 byId("redo").addEventListener("click", () => core.step("redo"));
+/** Panels that have nothing to work on before a volume is there. */
+const OF_PICTURE = ["colour", "cut", "view", "save", "shown"];
+for (const name of OF_PICTURE) byId(`panel-${name}`).inert = true;
+core.wire.on("welcome", (m) => {
+  if (!m.empty) return;
+  openTab("volumes", false);
+  core.note("info", "This master has no volume yet. Drop a file on the page, or use slabcast put.");
+});
 core.on("volume", (volume) => {
+  for (const name of OF_PICTURE) byId(`panel-${name}`).inert = false;
   setText(byId("volume-name"), volume.name);
   setText(byId("volume-shape"), `${volume.dims.join(" × ")} ${volume.sample_kind}`);
   document.title = `${volume.name} – slabcast`;

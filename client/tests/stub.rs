@@ -192,7 +192,6 @@ fn stats(frame: u64) -> FrameStats {
         result_bytes: None,
         slabs: vec![],
         quality: Quality::before(),
-        level: None,
         left_out: vec![],
         error: Default::default(),
         retries: 0,

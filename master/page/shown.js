@@ -1,0 +1,108 @@
+/** What the picture is: how far off, how long it took, which bytes; in a strip below it and in a panel. */
+
+import { bytesWords, h, setAttr, setText } from "./dom.js";
+
+/** @typedef {import("./core.js").Core} Core */
+
+/** A picture that is not there after this long is said to be drawn. */
+const LATE_MS = 200;
+
+/** Words for sources of error, as in docs/reference/statistics.md. */
+const SOURCES = {
+  cutoff: "pixels shut early", quantisation: "colours in 8 bits", accumulation: "sums in 16 bits",
+  rounding: "places on the grid", truncation: "kernel's end", thickness: "thickness of sheets",
+    ripple: "ripple of the kernel",
+};
+
+/**
+ * Largest error of all sources, in 1/255, or null.
+ * @param {any} error
+ */
+export function largestError(error) {
+  const values = Object.values(error ?? {}).filter((e) => e && Number.isFinite(/** @type {any} */ (e).value));
+  return values.length ? Math.max(...values.map((e) => /** @type {any} */ (e).value)) : null;
+}
+
+/** @param {number} ms */
+const msWords = (ms) => (ms < 9.95 ? ms.toFixed(1) : String(Math.round(ms)));
+
+/**
+ * @param {Core} core
+ * @param {any} strip
+ */
+export function shownPanel(core, strip) {
+  const part = (/** @type {string} */ name) => strip.querySelector(`[data-part="${name}"]`);
+  const parts = Object.fromEntries(["state", "ms", "level", "error", "hash"].map((n) => [n, part(n)]));
+  const facts = h("dl", { class: "facts" });
+  const errors = h("tbody");
+  const noErrors = h("p", { class: "hint" });
+  const left = h("ul", { class: "plain" });
+  const el = h("div", {},
+    h("section", {}, h("header", {}, h("h2", { text: "This picture" })), facts),
+    h("section", {}, h("header", {}, h("h2", { text: "How far it may be off" }),
+      h("span", { class: "aside", text: "in 1/255" })),
+      h("table", { class: "numbers" }, h("thead", {},
+        h("tr", {}, h("th", { scope: "col", text: "Source" }), h("th", { scope: "col", text: "Off" }),
+        h("th", { scope: "col", text: "Kind" }))), errors), noErrors),
+    h("section", {}, h("header", {}, h("h2", { text: "Left out" }),
+      h("span", { class: "aside", text: "this scene does not need it" })), left));
+  let hash = /** @type {any} */ (null);
+  /** @type {any} */
+  let last = null;
+  const draw = () => {
+    if (!last) return;
+    const still = last.pass === "still";
+    const stale = core.status.state !== "live";
+    strip.dataset.state = stale ? "stale" : still ? "still" : "moving";
+    setText(parts.state, stale ? "old picture" : still ? "sharp" : "moving");
+    setText(parts.ms, `${msWords(last.ms.total)} ms`);
+    setText(parts.level, last.level ? `level ${last.level}` : "full level");
+    const off = still ? largestError(last.error) : last.bound * 255;
+    setText(parts.error, off === null || Number.isNaN(off) ? "" : `off ≤ ${off < 9.95 ? off.toFixed(1) : Math.round(off)}/255`);
+    const known = still && hash && hash.message === last.source;
+    setText(parts.hash, known ? `${hash.hex.slice(0, 8)} ${hash.same ? "=" : "≠"} file` : "");
+    setAttr(parts.hash, "data-same", known ? String(hash.same) : null);
+    if (!el.isConnected || el.closest("[hidden]")) return;
+    const rows = [
+      ["Pass", still ? "still: the pixels of the file" : "moving: a preview"],
+      ["Size", last.size.join(" × ")],
+      ["Time", `${msWords(last.ms.total)} ms: ${msWords(last.ms.draw)} drawing, ${msWords(last.ms.encode)} encoding, ${msWords(last.ms.wait)} waiting`],
+      ["Level", String(last.level)],
+      ["Sheets", last.thickness ? `${Number(last.thickness.toFixed(3))} vox thick` : "–"],
+      ["Drawn by", `${last.workers} worker${last.workers === 1 ? "" : "s"}, ${last.threads} threads`],
+      ["Sent", bytesWords(last.bytes)],
+      ["Pixels here", known ? hash.hex : "–"],
+      ["Pixels of the file", last.sha256 ?? "–"],
+      ["View", last.view_sha256 ?? "–"],
+    ];
+    facts.replaceChildren(...rows.flatMap(([name, value]) => [h("dt", { text: name }),
+      h("dd", { text: value, class: /^[0-9a-f]{64}$/.test(value) ? "hash" : null })]));
+    const found = Object.entries(last.error ?? {});
+    errors.replaceChildren(...found.map(([name, e]) => h("tr", {},
+      h("th", { scope: "row", text: /** @type {any} */ (SOURCES)[name] ?? name }),
+      h("td", { text: e ? Number(/** @type {any} */ (e).value.toPrecision(2)) : "–" }),
+        h("td", { text: e ? /** @type {any} */ (e).kind : "not measured" }))));
+    noErrors.hidden = found.length > 0;
+    setText(noErrors, still ? "Nobody measured it for this picture." : "It is measured when the picture is at rest.");
+    left.replaceChildren(...((last.left_out ?? []).length ? last.left_out.map((/** @type {any} */ x) =>
+      h("li", {}, h("span", { text: x.name }), h("b",
+        { text: [x.saved_ms != null && `${x.saved_ms.toFixed(1)} ms`,
+        x.saved_bytes && bytesWords(x.saved_bytes)].filter(Boolean).join(", ") })))
+      : [h("li", { text: "Nothing." })]));
+  };
+  /** @type {any} */
+  let lateTimer = 0;
+  /** Says so if what is on the screen is still not what was asked for. */
+  const late = () => {
+    lateTimer = 0;
+    if (!last || core.status.state !== "live" || (last.seq === core.seq && last.scene === core.rev)) return;
+    strip.dataset.state = "moving";
+    setText(parts.state, "drawing");
+    setText(parts.hash, "");
+  };
+  core.on("state", () => { lateTimer ||= setTimeout(late, LATE_MS); });
+  core.on("painted", (m) => { last = { ...m, source: core.done }; draw(); });
+  core.on("hash", (x) => { hash = x; draw(); });
+  core.on("status", draw);
+  return { el, shown: draw };
+}

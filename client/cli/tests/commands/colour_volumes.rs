@@ -42,6 +42,9 @@ fn colours_are_drawn_alike_by_any_cut_and_by_a_cluster_and_are_colours() {
         &["--workers", "2", "--tile", "64", "-o", "a.png"],
         &["--schedule", "slab", "--slabs", "5", "-o", "a.png"],
         &["--cull", "off", "--keep", "empty", "-o", "a.png"],
+        // They have one level.
+        &["--level", "auto", "-o", "a.png"],
+        &["--level", "2", "-o", "a.png"],
     ] {
         assert_eq!(hash(dir, "rgb.nrrd", more), want, "{more:?}");
     }
@@ -118,6 +121,10 @@ fn what_colours_can_not_have_is_refused_with_a_remedy() {
         assert!(said.contains(say), "{more:?}: {said}");
         assert!(!dir.join("x.png").exists());
     }
+    let out = run(dir, &["convert", "rgb.nrrd", "rgb.ome.zarr"]);
+    let said = text(&out.stderr);
+    assert!(said.contains("take one of them with --channel"), "{said}");
+    assert!(!out.status.success() && !dir.join("rgb.ome.zarr").exists());
     let out = run(dir, &["lab", "error", "rgb.nrrd", "--azimuth", "30", "--size", "40x40"]);
     assert!(out.status.success(), "{}", text(&out.stderr));
 }

@@ -74,3 +74,18 @@ fn support_beyond_the_bins_meets_the_first_or_last() {
     let flat = ValueSummary::from_samples(&Samples::U16(vec![7; 9]), ValueMap::IDENTITY);
     assert_eq!(ValueBins::of(&flat).bin(7.0), 0);
 }
+
+#[test]
+fn colours_have_one_level() {
+    use crate::auto_level::AutoLevel;
+    use slabcast_common::volume::{ColourValue, Palette};
+    let palette = Palette::sorted(vec![[1, 2, 3, 255]], false, ColourValue::Luminance).unwrap();
+    let lattice = Lattice::from_spacing([8; 3], [1.0; 3]);
+    let grey = Volume::from_fn_u8("g", [8; 3], |i, _, _| i as u8);
+    let colours =
+        Volume::coloured("c", "RGB uint8", false, lattice, palette.into(), vec![0; 512]).unwrap();
+    assert!(coarser(&grey).is_some() && coarser(&colours).is_none());
+    // No view of it, so no sample covers a pixel.
+    let level = |volume: &Volume| AutoLevel::new(&volume.info(volume.digest())).level();
+    assert_eq!((level(&grey), level(&colours)), (3, 0));
+}

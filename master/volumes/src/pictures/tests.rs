@@ -218,3 +218,27 @@ fn folder_of_pictures_holds_one_volume() {
     let e = crate::open_with(folder.path(), &pick(1)).unwrap_err().to_string();
     assert!(e.contains("--volume: 1 is not there: the file has 1 volume; leave it out"), "{e}");
 }
+
+#[test]
+fn grey_and_opacity_are_two_channels_and_opacity_among_colours_is_the_fourth() {
+    let folder = tempfile::tempdir().unwrap();
+    let put = |name: &str, bytes: &[u8]| std::fs::write(folder.path().join(name), bytes).unwrap();
+    let open = |channel| {
+        let pick = crate::Pick { channel, ..crate::Pick::default() };
+        let hints = crate::Hints { pick, ..crate::Hints::default() };
+        crate::open_with(folder.path(), &hints).map(|opened| opened.volume)
+    };
+    let both: Vec<u8> = (0..6).flat_map(|i| [i, 30 + i]).collect();
+    put("1.png", &png((3, 2), (GrayscaleAlpha, Eight), None, &both));
+    assert_eq!(bytes(&open(Some(0)).unwrap()), [0, 1, 2, 3, 4, 5]);
+    assert_eq!(bytes(&open(Some(1)).unwrap()), [30, 31, 32, 33, 34, 35]);
+    let e = open(Some(2)).unwrap_err().to_string();
+    assert!(e.contains("--channel: 2 is not there: the file has 2 channels"), "{e}");
+    let rgb: Vec<u8> = (0..6).flat_map(|i| [i, 10 + i, 20 + i]).collect();
+    put("2.png", &png((3, 2), (Rgb, Eight), None, &rgb));
+    let blue = [0, 1, 2, 3, 4, 5, 20, 21, 22, 23, 24, 25];
+    assert_eq!(bytes(&open(Some(2)).unwrap()), blue);
+    let alpha = [30, 31, 32, 33, 34, 35, 255, 255, 255, 255, 255, 255];
+    assert_eq!(bytes(&open(Some(3)).unwrap()), alpha);
+    assert_eq!(open(None).unwrap().file_type, "RGBA uint8");
+}

@@ -343,3 +343,26 @@ fn bricks_of_colours_hold_places_and_normals_of_the_values() {
         }));
     }
 }
+
+#[test]
+fn edit_of_a_function_of_colours_cuts_what_a_new_store_holds() {
+    use slabcast_common::volume::{ColourValue, Palette};
+    let colours = (0..6000u32).map(|i| [(i % 250) as u8, (i / 250) as u8, 7, 255]).collect();
+    let palette = Palette::sorted(colours, false, ColourValue::Luminance).expect("distinct");
+    let dims = [200, 66, 5];
+    let lattice = Lattice::from_spacing(dims, [1.0; 3]);
+    let place = |i: u32| (i % 200 * 30 + i / 13200) as u16;
+    let places = (0..dims.iter().product()).map(place).collect();
+    let volume = Volume::coloured("c", "RGB uint8", false, lattice, palette.into(), places);
+    let volume = Arc::new(volume.expect("places in it"));
+    let digest = volume.digest();
+    let source: Arc<dyn BlockSource> = Arc::new(MemorySource::new(volume.clone(), digest));
+    let needs = |lo, hi| BrickNeeds { support: span(lo, hi), ..BrickNeeds::default() };
+    let before = BrickStore::cut(&source, 0, &needs(100.0, 1500.0), None, u64::MAX).unwrap();
+    for (lo, hi) in [(100.0, 1501.0), (3000.0, 5999.0), (90.0, 1500.0), (100.0, 1500.0)] {
+        let needs = needs(lo, hi);
+        let after = BrickStore::cut(&source, 0, &needs, Some(&before), u64::MAX).unwrap();
+        assert_same(&after, &BrickStore::build(&volume, digest, &needs));
+        assert!(after.relevant_voxels() > 0);
+    }
+}

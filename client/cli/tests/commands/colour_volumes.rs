@@ -44,7 +44,6 @@ fn colours_are_drawn_alike_by_any_cut_and_by_a_cluster_and_are_colours() {
         &["--cull", "off", "--keep", "empty", "-o", "a.png"],
         // They have one level.
         &["--level", "auto", "-o", "a.png"],
-        &["--level", "2", "-o", "a.png"],
     ] {
         assert_eq!(hash(dir, "rgb.nrrd", more), want, "{more:?}");
     }

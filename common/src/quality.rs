@@ -229,7 +229,7 @@ impl Quality {
     /// Names the first field that is out of range, has no meaning beside the kernel, or is not
     /// supported by this version.
     pub fn check(&self) -> Result<(), InvalidField> {
-        // From vox/64 to thicker than any volume (docs/design/model.md section 5).
+        // From vox/64 to thicker than any volume (docs/design/model.md section 6).
         within("thickness", self.thickness, 1.0 / 64.0, 65536.0)?;
         within("eps", self.eps, 0.0, 0.5)?;
         // Below .4 a lattice shows through as dots (ripple over 20 %), and the head-room of the

@@ -25,7 +25,7 @@ pub const SUBPIXEL_BITS: u32 = 8;
 /// Screen positions a pixel, 256; [`SUBPIXEL_BITS`] argues for the number.
 pub const SUBPIXELS: i32 = 1 << SUBPIXEL_BITS;
 
-/// Largest picture edge in pixels (docs/design/model.md section 5: images of 1x1 and 8192x8192).
+/// Largest picture edge in pixels (docs/design/model.md section 6: images of 1x1 and 8192x8192).
 pub const MAX_EDGE: u32 = 8192;
 
 /// Distance of the near plane, as a share of the eye's distance from the target

@@ -134,7 +134,7 @@ pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
     Digest32(h.finalize().into())
 }
 
-/// Writes the bounds that are known without a reference (docs/design/model.md section 5) into
+/// Writes the bounds that are known without a reference (docs/design/model.md section 6) into
 /// `stats`, in 1/255. `within`: box of the voxels that are drawn; `max_alpha`: largest opacity of a
 /// pixel.
 fn error(

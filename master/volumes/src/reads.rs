@@ -1,7 +1,7 @@
 //! The formats that are read: one list, from which messages, help texts and documents have theirs.
 //!
 //! Tests compare the crate's documentation, the table of docs/reference/files.md and the help of
-//! `--series`, `--dataset` and `--level` with it. A format that is added here and not there fails them.
+//! `--series` and `--dataset` with it. A format that is added here and not there fails them.
 
 use crate::error::Problem;
 use crate::{Hints, RawHints};
@@ -13,8 +13,6 @@ pub enum Flag {
     Series,
     /// `--dataset`: one of several arrays.
     Dataset,
-    /// `--level`: a level of a pyramid.
-    Level,
     /// `--spacing`: the distances of samples.
     Spacing,
     /// `--dims`, `--type`, `--byte-order` and `--skip`: what a header would say.
@@ -23,14 +21,13 @@ pub enum Flag {
 
 impl Flag {
     /// Flags that name a part of a file.
-    const PARTS: [Flag; 3] = [Flag::Series, Flag::Dataset, Flag::Level];
+    const PARTS: [Flag; 2] = [Flag::Series, Flag::Dataset];
 
     /// Returns the flag as users type it.
     pub fn name(self) -> &'static str {
         match self {
             Flag::Series => "--series",
             Flag::Dataset => "--dataset",
-            Flag::Level => "--level",
             Flag::Spacing => "--spacing",
             Flag::Raw => "--type, --skip, --byte-order",
         }
@@ -41,7 +38,6 @@ impl Flag {
         match self {
             Flag::Series => hints.series.is_some(),
             Flag::Dataset => hints.dataset.is_some(),
-            Flag::Level => hints.level.is_some(),
             Flag::Spacing => hints.raw.spacing.is_some(),
             Flag::Raw => {
                 let spacing = RawHints { spacing: hints.raw.spacing, ..RawHints::default() };
@@ -111,7 +107,7 @@ pub(crate) const DICOM: &ReadFormat =
     &ReadFormat { documented: "DICOM", ..read("DICOM slices", &[".dcm", ".ima"], &[Flag::Series]) };
 pub(crate) const ZARR: &ReadFormat = &read("Zarr", &[], &[Flag::Spacing]);
 pub(crate) const OME_ZARR: &ReadFormat =
-    &ReadFormat { documented: "OME-Zarr", ..read("OME-Zarr", &[], &[Flag::Level]) };
+    &ReadFormat { documented: "OME-Zarr", ..read("OME-Zarr", &[], &[]) };
 pub(crate) const RAW: &ReadFormat = &ReadFormat {
     documented: "raw numbers",
     ..read("raw numbers with --dims and --type", &[".raw", ".raw.gz"], &[Flag::Spacing, Flag::Raw])
@@ -262,10 +258,7 @@ mod tests {
                     raw numbers with --dims and --type or formula:NAME";
         assert_eq!(said, want);
         assert_eq!(takers(Flag::Dataset), ".npz, .vti, .vtk");
-        assert_eq!(
-            (takers(Flag::Series), takers(Flag::Level)),
-            ("DICOM slices".into(), "OME-Zarr".into())
-        );
+        assert_eq!(takers(Flag::Series), "DICOM slices");
         for name in ["a.NII.gz", "b.mgz", "c.tif", "x.raw"] {
             assert!(is_volume_name(name), "{name}");
         }
@@ -276,17 +269,12 @@ mod tests {
     fn flag_that_a_format_has_no_use_for_is_refused_by_every_format() {
         let series = Hints { series: Some("1".into()), ..Hints::default() };
         let dataset = Hints { dataset: Some("a".into()), ..Hints::default() };
-        let level = Hints { level: Some(1), ..Hints::default() };
         for format in FORMATS {
-            for (flag, hints) in
-                [(Flag::Series, &series), (Flag::Dataset, &dataset), (Flag::Level, &level)]
-            {
+            for (flag, hints) in [(Flag::Series, &series), (Flag::Dataset, &dataset)] {
                 let takes = format.flags.contains(&flag);
                 assert_eq!(hints.check_flags(format).is_ok(), takes, "{flag:?} {format:?}");
             }
         }
-        let e = level.check_flags(RAW).unwrap_err().to_string();
-        assert_eq!(e, "--level: is for OME-Zarr, and this is raw numbers; leave it out");
         let e = crate::open_with("formula:spheres:8".as_ref(), &series).unwrap_err().to_string();
         assert!(e.contains("--series: is for DICOM slices, and this is formula:NAME"), "{e}");
         let e = dataset.check_flags(NRRD).unwrap_err().to_string();

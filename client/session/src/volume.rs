@@ -55,7 +55,7 @@ pub struct InputArgs {
     /// faster and looks alike. Of an OME-Zarr picture level N of the file is read, by default the
     /// finest that fits into memory.
     #[arg(long, value_name = "auto|N", value_parser = parse::level, allow_negative_numbers = true,
-          help_heading = HEADING)]
+          help_heading = HEADING, hide_short_help = true)]
     level: Option<LevelChoice>,
     /// Most bytes that the samples may take [default: 1 GiB or 64 times the file, in free memory]
     #[arg(long, value_name = "BYTES", value_parser = parse::memory, help_heading = HEADING,

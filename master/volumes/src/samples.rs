@@ -25,10 +25,10 @@ use std::panic::AssertUnwindSafe;
 use std::sync::mpsc;
 
 /// Most samples along an axis. A header that asks for more is likelier wrong than large: with
-/// [`SAMPLES_MAX`] the other two axes would average below 724.
+/// [`SAMPLES_MAX`] the other two axes would average below 2048.
 pub(crate) const DIM_MAX: u64 = 16384;
-/// Most samples of a volume: 2048^3, 8 GiB of 8-bit codes. More would need bricks read on demand.
-pub(crate) const SAMPLES_MAX: u64 = 1 << 33;
+/// Most samples of a volume: 4096^3, as many as [`MAX_BRICKS`] bricks hold.
+pub(crate) const SAMPLES_MAX: u64 = 1 << 36;
 /// Most bytes that are inflated only to be skipped (NIfTI extensions, a byte skip inside gzip).
 /// Dense deflate decodes 240 MB/s (`examples/load` on 64 MiB of noise in 4 bits: 0.27 s), so this
 /// is 0.07 s of the 0.1 s that docs/design/promises.md R13 allows for refusing a file.

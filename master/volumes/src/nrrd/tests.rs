@@ -290,7 +290,7 @@ fn nrrd_errors_name_field_and_remedy() {
         (with("3 2 1", "3 2 -1"), "has something else than whole numbers"),
         (with("3 2 1", "3 0 1"), "3 x 0 x 1 has no samples"),
         (with("3 2 1", "3 2 99999"), "is longer than 16384"),
-        (with("3 2 1", "16384 16384 16384"), "has more than 8589934592 samples"),
+        (with("3 2 1", "16384 16384 16384"), "has more than 68719476736 samples"),
         (with("dimension: 3", "dimension: 2"), "sizes (line 4)"),
         (with("dimension: 3", "dimension: 0"), "`0` is not 1 to 16"),
         (with("type: uint8", "type uint8"), "line 2: `type uint8` is neither"),

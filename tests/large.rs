@@ -118,6 +118,10 @@ async fn picture_that_can_not_fit_is_refused_with_figures_and_a_coarser_one_is_d
     assert!(reason.contains("MiB") && reason.contains("--level auto"), "{reason}");
     let auto = draw(&master.handle(), request("auto", None, LevelChoice::Auto)).await;
     assert_eq!(auto.expect("it is small enough").len(), 4);
+    // A few blocks in the middle of the whole.
+    let mut cropped = request("crop", None, LevelChoice::At(0));
+    cropped.path.crop = Some("48%:52%,48%:52%,48%:52%".parse().expect("a box"));
+    assert_eq!(draw(&master.handle(), cropped).await.expect("it is small enough").len(), 4);
     let near = draw(&master.handle(), request("near", Some(70.0), LevelChoice::At(0))).await;
     assert_eq!(near.expect("few blocks are in view").len(), 4);
     let _ = stop.send(true);

@@ -46,15 +46,25 @@ impl ValueBins {
     }
 
     /// Returns a support grown to whole bins: the same for all supports with ends in the same bins. What
-    /// lies beyond the bins stays out unless `support` reaches there.
+    /// lies beyond the bins stays out unless `support` reaches there. An end stays as it is where growing
+    /// would add more than [`ADDED_DIVISOR`] allows of the samples that `summary` counts: air, above all.
     #[must_use]
-    pub fn rounded(&self, support: &Support) -> Support {
+    pub fn rounded(&self, support: &Support, summary: &ValueSummary) -> Support {
         let edge = |bin: u32| self.first_code + self.width * f64::from(bin);
+        let place = |code: f64| summary.bin(code.clamp(summary.min_code, summary.max_code));
+        let count = |range: std::ops::Range<usize>| -> u64 {
+            summary.histogram.get(range).map_or(0, |counts| counts.iter().sum())
+        };
         let rounded = |&(a, b): &(f64, f64)| {
-            let first = edge(self.bin(a));
+            let first = a.min(edge(self.bin(a)));
             // Codes at the edge belong to the next bin.
-            let end = edge(self.bin(b) + 1).next_down();
-            (a.min(first), b.max(end))
+            let end = b.max(edge(self.bin(b) + 1).next_down());
+            let stored = count(place(a)..place(b) + 1);
+            let fits = |added: u64| added <= stored / ADDED_DIVISOR;
+            (
+                if fits(count(place(first)..place(a))) { first } else { a },
+                if fits(count(place(b) + 1..place(end) + 1)) { end } else { b },
+            )
         };
         let all = support.intervals.iter().map(rounded).map(|interval| vec![interval]);
         let none = Support { intervals: Vec::new(), nan: support.nan };
@@ -62,26 +72,49 @@ impl ValueBins {
     }
 }
 
+/// Rounding adds at most the samples that are stored divided by this.
+const ADDED_DIVISOR: u64 = 32;
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::volume::{SampleKind, ValueMap};
+
+    fn open(a: f64) -> (f64, f64) {
+        (a, f64::INFINITY)
+    }
+
+    /// Bins of four codes, and a summary of 256 codes of which each has `counts(code)` samples.
+    fn bins(counts: impl Fn(usize) -> u64) -> (ValueBins, ValueSummary) {
+        let counts: Vec<u64> = (0..256).map(counts).collect();
+        let summary = ValueSummary::from_code_counts(SampleKind::U8, &counts, ValueMap::IDENTITY);
+        (ValueBins { first_code: 0.0, width: 4.0 }, summary)
+    }
 
     #[test]
     fn supports_with_ends_in_the_same_bins_are_rounded_to_the_same() {
-        let bins = ValueBins { first_code: 0.0, width: 4.0 };
+        let (bins, summary) = bins(|_| 1);
         let of = |intervals: &[(f64, f64)]| {
-            bins.rounded(&Support { intervals: intervals.to_vec(), nan: true })
+            let support = Support { intervals: intervals.to_vec(), nan: true };
+            bins.rounded(&support, &summary)
         };
-        let open = |a| (a, f64::INFINITY);
         assert_eq!(of(&[open(16.0)]), of(&[open(19.9)]));
         assert_ne!(of(&[open(16.0)]), of(&[open(15.9)]));
         assert_eq!(of(&[open(17.0)]).intervals, [open(16.0)]);
-        let both = of(&[(17.0, 18.0), (21.0, 30.0), (60.0, 60.0)]);
-        assert_eq!(
-            both.intervals,
-            [(16.0, 20f64.next_down()), (20.0, 32f64.next_down()), (60.0, 64f64.next_down())]
-        );
-        assert!(both.nan && both.contains(19.99) && !both.contains(32.0));
+        let both = of(&[(17.0, 130.0), (141.0, 255.0)]);
+        assert_eq!(both.intervals, [(16.0, 132f64.next_down()), (140.0, 256f64.next_down())]);
+        assert!(both.nan && both.contains(131.9) && !both.contains(132.0));
         assert_eq!(of(&[(-9.0, 300.0)]).intervals, [(-9.0, 300.0)], "beyond the bins as it was");
+    }
+
+    #[test]
+    fn air_is_not_stored_for_the_sake_of_a_bin() {
+        let (bins, summary) = bins(|code| if code == 0 { 10_000 } else { 10 });
+        let of = |a| {
+            let support = Support { intervals: vec![open(a)], nan: false };
+            bins.rounded(&support, &summary).intervals
+        };
+        assert_eq!(of(1.0), [open(1.0)]);
+        assert_eq!(of(5.0), [open(4.0)]);
     }
 }

@@ -58,7 +58,7 @@ impl BrickNeeds {
             },
             Classify::After => BrickNeeds {
                 support: ValueBins::of(&info.summary)
-                    .rounded(&classifier.support().filled(&info.summary)),
+                    .rounded(&classifier.support().filled(&info.summary), &info.summary),
                 normals: false,
                 gradients: false,
                 halo: HALO,

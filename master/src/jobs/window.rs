@@ -8,12 +8,38 @@
 use super::submit::SubmitError;
 use crate::library::{OpenVolume, VolumeError};
 use crate::memory::{Shares, brick_set_bytes, mib};
-use slabcast_common::block_set::BlockSet;
+use glam::DVec3;
+use slabcast_common::block_set::{BLOCK_EDGE, BlockSet, block_dims};
+use slabcast_common::crop::CropBox;
 use slabcast_common::quality::InvalidField;
 use slabcast_common::view::View;
+use slabcast_common::volume::Lattice;
 use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_volumes::store::{Estimate, estimate};
 use std::sync::Arc;
+
+/// Returns the blocks of a set of which a voxel may lie in a cropping box.
+fn within(blocks: &BlockSet, crop: &CropBox, lattice: &Lattice) -> BlockSet {
+    let mut inside = BlockSet::new(lattice.dims);
+    let [nx, ny, nz] = block_dims(lattice.dims).map(|n| n as usize);
+    for block in (0..nx * ny * nz).filter(|&block| blocks.contains(block)) {
+        let at = [block % nx, block / nx % ny, block / nx / ny];
+        let ends = [0, 1].map(|end| {
+            let at = at.map(|n| ((n + end) as f64) * f64::from(BLOCK_EDGE));
+            DVec3::from_array(at) - lattice.centre_index()
+        });
+        let corners = (0..8).map(|i| {
+            let corner = DVec3::new(ends[i & 1].x, ends[i >> 1 & 1].y, ends[i >> 2].z);
+            lattice.world_from_index() * corner
+        });
+        let none = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+        let (lo, hi) = corners.fold(none, |(lo, hi), p| (lo.min(p), hi.max(p)));
+        if lo.cmple(crop.hi).all() && hi.cmpge(crop.lo).all() {
+            inside.insert(block);
+        }
+    }
+    inside
+}
 
 /// Bytes of memory that a brick takes beside its contents, at the master and at each worker: its entry
 /// in the directory, its places in the tables of workers, and what is known of its use.
@@ -49,6 +75,10 @@ pub(super) fn fit(
     }
     let mut window = BlockSet::new(info.lattice.dims);
     views(&mut |view| window.add_visible(view))?;
+    if let Some(crop) = &needs.crop {
+        window =
+            within(&window, &crop.grown(&info.lattice, f64::from(needs.halo + 1)), &info.lattice);
+    }
     let needs = BrickNeeds { window: Some(Arc::new(window)), ..needs };
     let Estimate { blocks, bricks, bytes } = count(&needs)?;
     let directory = bricks * DIRECTORY_BYTES;

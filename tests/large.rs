@@ -34,7 +34,7 @@ fn start(source: Arc<dyn BlockSource>, brick_bytes: u64, stop: &watch::Receiver<
     let config = Config {
         name: "worker".into(),
         threads: 2,
-        memory_budget_bytes: brick_bytes.min(1 << 30),
+        memory_budget_bytes: 1 << 30,
         simd: Simd::detect(),
         rehearsal: None,
         machine: String::new(),

@@ -384,12 +384,12 @@ mod tests {
             (
                 Hello { protocol_versions: newer, ..hello() },
                 AttachError::Protocol { worker: newer },
-                ["protocol 9 to 10".into(), format!("master {PROTOCOL_VERSIONS};")],
+                [format!("protocol {newer}"), format!("master {PROTOCOL_VERSIONS};")],
             ),
             (
                 Hello { protocol_versions: older, ..hello() },
                 AttachError::Protocol { worker: older },
-                ["protocol 7,".into(), format!("master {PROTOCOL_VERSIONS};")],
+                [format!("protocol {older},"), format!("master {PROTOCOL_VERSIONS};")],
             ),
             (
                 Hello { pixels_version: 99, ..hello() },

@@ -24,7 +24,7 @@ fn orientation() -> Orientation {
     Orientation::new(None, None).expect("the defaults")
 }
 
-/// A master of one source that may hold `brick_bytes` of bricks, and a worker of this process.
+/// A master of one source and a worker of this process, with at most `brick_bytes` of bricks each.
 fn start(source: Arc<dyn BlockSource>, brick_bytes: u64, stop: &watch::Receiver<bool>) -> Master {
     let mut config = MasterConfig::of(Library::of_source(source, orientation()));
     config.shares = Shares { bricks: brick_bytes, ..Shares::default() };
@@ -34,7 +34,7 @@ fn start(source: Arc<dyn BlockSource>, brick_bytes: u64, stop: &watch::Receiver<
     let config = Config {
         name: "worker".into(),
         threads: 2,
-        memory_budget_bytes: 1 << 30,
+        memory_budget_bytes: brick_bytes.min(1 << 30),
         simd: Simd::detect(),
         rehearsal: None,
         machine: String::new(),
@@ -88,7 +88,6 @@ fn cells(size: &str) -> Arc<dyn BlockSource> {
     Arc::new(FormulaSource::open(&text).expect("a size"))
 }
 
-#[ignore = "took over 120 s where worker and master had 6 MiB each; not yet known why"]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn pictures_are_the_same_with_all_bricks_in_memory_and_with_hardly_any() {
     let (stop, stopped) = watch::channel(false);

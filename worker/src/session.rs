@@ -414,6 +414,8 @@ impl<'a> Session<'a> {
             arrived += 1;
             if let Some(table) = self.cache.table(set) {
                 self.stalls.brick_arrived(set, table, id, &mut unstalled);
+            } else {
+                self.stalls.bricks_without_table();
             }
             for ready in self.waiting.brick_arrived(set, id) {
                 self.start(ready);

@@ -68,6 +68,9 @@ pub(crate) struct Stalls {
     /// Value of `clock` when a brick was drawn last, or arrived, by place.
     last_used: BTreeMap<BrickSetKey, Vec<u64>>,
     clock: u64,
+    /// Upper bound of the encoded bytes of the bricks here that no region keeps. A search of all bricks
+    /// sets it. It spares the search where it can't make enough room.
+    droppable_bytes: u64,
     /// Number of requests that went over the budget.
     pub(crate) over_budget: u64,
 }
@@ -82,6 +85,7 @@ impl Stalls {
             kept: BTreeMap::new(),
             last_used: BTreeMap::new(),
             clock: 0,
+            droppable_bytes: u64::MAX,
             over_budget: 0,
         }
     }
@@ -112,8 +116,8 @@ impl Stalls {
             }
         }
         region.asked = region.missing.is_empty();
-        let (set, goes_on) = (region.set, region.missing.is_empty());
-        self.release(set, before);
+        let (set, table, goes_on) = (region.set, region.table.clone(), region.asked);
+        self.release(set, &table, before);
         goes_on
     }
 
@@ -149,15 +153,31 @@ impl Stalls {
     }
 
     /// Ends a region's claim on bricks.
-    fn release(&mut self, set: BrickSetKey, places: impl IntoIterator<Item = u32>) {
+    fn release(
+        &mut self,
+        set: BrickSetKey,
+        table: &BrickTable,
+        places: impl IntoIterator<Item = u32>,
+    ) {
         for place in places {
             if let Some(n) = self.kept.get_mut(&(set, place)) {
                 *n -= 1;
                 if *n == 0 {
                     self.kept.remove(&(set, place));
+                    self.may_drop(u64::from(table.bricks()[place as usize].bytes));
                 }
             }
         }
+    }
+
+    /// Notes that at most `bytes` encoded bytes of bricks may be dropped that could not before.
+    fn may_drop(&mut self, bytes: u64) {
+        self.droppable_bytes = self.droppable_bytes.saturating_add(bytes);
+    }
+
+    /// Notes that bricks have come of a set without a directory, from which no region draws.
+    pub(crate) fn bricks_without_table(&mut self) {
+        self.droppable_bytes = u64::MAX;
     }
 
     /// Removes a region that is done, failed, or of a frame that has ended. `touched`: places of
@@ -181,7 +201,7 @@ impl Stalls {
                 }
             }
         }
-        self.release(region.set, region.keeps);
+        self.release(region.set, &region.table, region.keeps);
     }
 
     /// Removes the regions of a frame that were stalled, and returns them.
@@ -212,8 +232,12 @@ impl Stalls {
         let last_used = self.last_used.entry(set).or_default();
         last_used.resize(table.bricks().len().max(last_used.len()), 0);
         last_used[place as usize] = self.clock;
+        let bytes = u64::from(table.bricks()[place as usize].bytes);
         if self.requested.remove(&(set, place)).is_some() {
-            self.requested_bytes -= u64::from(table.bricks()[place as usize].bytes);
+            self.requested_bytes -= bytes;
+        }
+        if !self.kept.contains_key(&(set, place)) {
+            self.may_drop(bytes);
         }
         // Regions whose request was put off as well as those that asked.
         for (key, region) in self.regions.iter_mut().filter(|(_, s)| s.set == set) {
@@ -233,7 +257,11 @@ impl Stalls {
             return requests;
         }
         // Of sets without a directory nothing is drawn, and their bricks go first.
+        let sets = self.last_used.len();
         self.last_used.retain(|set, _| cache.table(*set).is_some());
+        if self.last_used.len() < sets {
+            self.droppable_bytes = u64::MAX;
+        }
         // Bricks that came without being asked for may exceed the budget, too.
         self.make_room(cache, 0, true, &mut requests);
         let oldest = self.regions.keys().next().copied();
@@ -286,6 +314,10 @@ impl Stalls {
         if after <= self.budget_bytes {
             return true;
         }
+        let too_few = after.saturating_sub(self.droppable_bytes) > self.budget_bytes;
+        if self.droppable_bytes == 0 || (too_few && !urgent) {
+            return false;
+        }
         let excess = (after - self.budget_bytes) + self.budget_bytes / SPARE_DIVISOR;
         let mut victims: Vec<(u64, BrickSetKey, BrickId, u64)> = Vec::new();
         for (set, ids) in cache.held() {
@@ -303,6 +335,7 @@ impl Stalls {
             }
         }
         let all: u64 = victims.iter().map(|v| v.3).sum();
+        self.droppable_bytes = all;
         if !urgent && after - all.min(after) > self.budget_bytes {
             return false;
         }
@@ -316,6 +349,7 @@ impl Stalls {
             freed += size;
             gone.entry(set).or_default().push(id);
         }
+        self.droppable_bytes -= freed;
         for (set, ids) in gone {
             cache.remove(set, &ids);
             requests.push(BrickRequest::Forgotten(set, ids));

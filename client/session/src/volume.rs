@@ -154,9 +154,9 @@ impl InputArgs {
         let mut bar = None;
         let mut told = |there: u64, total: u64| {
             let bar = bar.get_or_insert_with(|| Progress::new(false).counting("MiB"));
-            bar.uploaded(there, total, &format!("{}: first look", path.display()));
+            bar.uploaded(there, total, &format!("{}: first pass", path.display()));
         };
-        let opened = source(path, &self.hints(), &mut told);
+        let opened = source(path, &self.hints(), Packed::Converted, &mut told);
         if let Some(bar) = bar {
             bar.end();
         }
@@ -191,7 +191,7 @@ impl InputArgs {
     ) -> Result<(OpenedSource, Vec<String>), OpenError> {
         let mut hints = self.hints();
         hints.max_bytes = Some(hints.max_bytes.map_or(most_bytes, |asked| asked.min(most_bytes)));
-        source(path, &hints, &mut |_, _| ())
+        source(path, &hints, Packed::Refused, &mut |_, _| ())
     }
 }
 
@@ -251,16 +251,17 @@ impl OpenedSource {
     }
 }
 
-/// Opens a volume in memory; a large pyramid, and what does not fit, by blocks. `on_progress` gets the
-/// bytes looked at and those in all.
+/// Opens a volume in memory; a large pyramid, and a volume that doesn't fit, by blocks. `packed` says
+/// whether a packed file that doesn't fit is converted. `on_progress` gets the bytes looked at and
+/// those in all.
 fn source(
     path: &Path,
     hints: &Hints,
+    packed: Packed,
     on_progress: &mut dyn FnMut(u64, u64),
 ) -> Result<(OpenedSource, Vec<String>), OpenError> {
-    let of_file = |source| (OpenedSource { source, volume: None }, Vec::new());
     if is_large(path, hints) {
-        return by_blocks(path, hints, on_progress).map(of_file);
+        return by_blocks(path, hints, packed, on_progress);
     }
     match slabcast_volumes::open_with(path, hints) {
         Ok(opened) => {
@@ -269,26 +270,40 @@ fn source(
             Ok((OpenedSource { source, volume: Some(volume) }, opened.notes))
         }
         Err(e) if e.problem.kind == OpenErrorKind::TooLarge => {
-            by_blocks(path, hints, on_progress).map(of_file).map_err(|_| e)
+            let by_blocks = by_blocks(path, hints, packed, on_progress);
+            // A disk that is too small for the picture is the reason that helps.
+            by_blocks.map_err(|other| if other.problem.field == "cache" { other } else { e })
         }
         Err(e) => Err(e),
     }
 }
 
 #[cfg(feature = "zarr")]
-use slabcast_volumes::blocks::is_large;
+use slabcast_volumes::blocks::{Packed, is_large, open_source};
+
+/// Treatment of packed files that don't fit, of a program that reads none by blocks.
+#[cfg(not(feature = "zarr"))]
+#[derive(Clone, Copy)]
+enum Packed {
+    Refused,
+    Converted,
+}
 
 #[cfg(feature = "zarr")]
 fn by_blocks(
     path: &Path,
     hints: &Hints,
+    packed: Packed,
     on_progress: &mut dyn FnMut(u64, u64),
-) -> Result<Arc<dyn BlockSource>, OpenError> {
+) -> Result<(OpenedSource, Vec<String>), OpenError> {
+    let mut notes = Vec::new();
     let mut told = |done, total| {
         on_progress(done, total);
         Ok(())
     };
-    slabcast_volumes::blocks::open_source(path, hints, cache_folder().as_deref(), &mut told)
+    let cache = cache_folder();
+    let opened = open_source(path, hints, cache.as_deref(), packed, &mut notes, &mut told);
+    Ok((OpenedSource { source: opened?, volume: None }, notes))
 }
 
 #[cfg(not(feature = "zarr"))]
@@ -300,10 +315,12 @@ fn is_large(_path: &Path, _hints: &Hints) -> bool {
 fn by_blocks(
     path: &Path,
     hints: &Hints,
+    _packed: Packed,
     _on_progress: &mut dyn FnMut(u64, u64),
-) -> Result<Arc<dyn BlockSource>, OpenError> {
+) -> Result<(OpenedSource, Vec<String>), OpenError> {
     let opened = slabcast_volumes::open_with(path, hints)?;
-    Ok(Arc::new(MemorySource::of(opened.volume)))
+    let source = Arc::new(MemorySource::of(opened.volume));
+    Ok((OpenedSource { source, volume: None }, opened.notes))
 }
 
 /// Returns the folder for what was found out about large volumes: `SLABCAST_CACHE`, or `slabcast` in the

@@ -175,7 +175,8 @@ impl Plan {
                 (**tf).clone()
             }
         };
-        let framing = framing_of(&request.path, &*open.source, &transfer, served.orientation)?;
+        let (source, outlines) = (&*open.source, &*served.outlines);
+        let framing = framing_of(&request.path, source, outlines, &transfer, served.orientation)?;
         let request = Arc::new(request);
         // The request stays as it came: the same key has to mean the same request.
         let framed = framing.as_ref().map(|f| Box::new(request.path.framed(f)));

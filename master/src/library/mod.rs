@@ -25,6 +25,7 @@ use slabcast_scene::path::Orientation;
 use slabcast_scene::request::VolumeChoice;
 use slabcast_volumes::blocks::{BlockSource, MemorySource};
 use slabcast_volumes::endings;
+use slabcast_volumes::framing::Outlines;
 use std::collections::BTreeMap;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
@@ -55,6 +56,8 @@ pub struct ServedVolume {
     pub info: VolumeInfo,
     /// Axes of the volume that are up and front.
     pub orientation: Orientation,
+    /// Outlines to which paths were framed lately.
+    pub outlines: Arc<Outlines>,
 }
 
 impl ServedVolume {
@@ -72,6 +75,7 @@ impl ServedVolume {
             anatomical: info.summary.anatomical,
             info,
             orientation,
+            outlines: Arc::default(),
         }
     }
 }
@@ -701,7 +705,8 @@ impl Entries {
         entry.uploader = uploader;
         let VolumeHeader { name: own, file_type, info, orientation } = stored.header;
         let anatomical = info.summary.anatomical;
-        let served = ServedVolume { name: own, file_type, anatomical, info, orientation };
+        let outlines = Arc::default();
+        let served = ServedVolume { name: own, file_type, anatomical, info, orientation, outlines };
         entry.served = Some(Arc::new(served));
         self.by_name.insert(name, entry);
     }

@@ -47,7 +47,7 @@ pub(super) async fn describe(
         Ok((served, name))
     });
     let (served, name) = described.await.ok_or_else(ending)?.map_err(|e| volume_status(&e))?;
-    let ServedVolume { name: _, file_type, anatomical, info, orientation } = (*served).clone();
+    let ServedVolume { file_type, anatomical, info, orientation, .. } = (*served).clone();
     Ok(convert::volume_to_wire(&model::VolumeDescription {
         name,
         file_type,

@@ -17,6 +17,8 @@ use slabcast_common::volume::{Digest32, SampleKind, Samples, Volume, VolumeInfo}
 use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_scene::path::{CropBox, Framing, Orientation, ViewPath};
 use slabcast_scene::tween::Tween;
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// Edge of a cell in voxels.
 const EDGE: usize = 8;
@@ -175,7 +177,7 @@ pub fn framing(
     orientation: Orientation,
 ) -> Result<Option<Framing>, InvalidField> {
     let source = MemorySource::new(volume, info.digest);
-    framing_of(path, &source, transfer, orientation).map_err(|e| match e {
+    framing_of(path, &source, &Outlines::default(), transfer, orientation).map_err(|e| match e {
         FramingError::Field(field) => field,
         FramingError::File(problem) => unreachable!("samples in memory can be read: {problem}"),
     })
@@ -196,14 +198,53 @@ pub enum FramingError {
     File(#[from] Problem),
 }
 
+/// Outlines that [`Outlines`] keeps. Each may have read 2^28 samples, and has a thousandth of them.
+const OUTLINES_KEPT: usize = 8;
+
+/// An outline, and what decides it within one source: level, visible codes and crop.
+type KnownOutline = (usize, Support, Option<CropBox>, Arc<[[u32; 3]]>);
+
+/// The latest outlines of one volume, so that requests with one transfer function read it once.
+#[derive(Debug, Default)]
+pub struct Outlines(Mutex<VecDeque<KnownOutline>>);
+
+impl Outlines {
+    /// Returns [`outline`] of a level of the source, from memory if it was asked for lately.
+    ///
+    /// # Errors
+    /// A file can't be read, or is damaged.
+    fn of(
+        &self,
+        source: &dyn BlockSource,
+        level: usize,
+        support: &Support,
+        crop: Option<&CropBox>,
+    ) -> Result<Arc<[[u32; 3]]>, Problem> {
+        let known = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_it = |(of, codes, within, _): &KnownOutline| {
+            *of == level && codes == support && within.as_ref() == crop
+        };
+        if let Some((.., points)) = known().iter().find(|known| is_it(known)) {
+            return Ok(points.clone());
+        }
+        let points: Arc<[[u32; 3]]> = outline_of(source, level, support, crop)?.into();
+        let mut known = known();
+        known.retain(|known| !is_it(known));
+        known.truncate(OUTLINES_KEPT - 1);
+        known.push_front((level, support.clone(), crop.copied(), points.clone()));
+        Ok(points)
+    }
+}
+
 /// Returns the framing of a path like [`framing`], to a volume that is read in boxes. Positions are
-/// those of its finest level.
+/// those of its finest level. `outlines` are those of `source` that are known.
 ///
 /// # Errors
 /// The field of the path or function that doesn't fit the volume; or a file that can't be read.
 pub fn framing_of(
     path: &ViewPath,
     source: &dyn BlockSource,
+    outlines: &Outlines,
     transfer: &TransferFunction,
     orientation: Orientation,
 ) -> Result<Option<Framing>, FramingError> {
@@ -219,8 +260,8 @@ pub fn framing_of(
     let level = levels.iter().position(is_small).unwrap_or(levels.len() - 1);
     let to_level = finest.lattice.to_centre_of(&levels[level].lattice);
     let needs = needs.at_centre(to_level);
-    let points = outline_of(source, level, &needs.support, needs.crop.as_ref())?;
-    let points: Vec<_> = points.into_iter().map(|p| in_finest(levels, level, p)).collect();
+    let points = outlines.of(source, level, &needs.support, needs.crop.as_ref())?;
+    let points: Vec<_> = points.iter().map(|&p| in_finest(levels, level, p)).collect();
     Ok(path.framing(&points, &finest.lattice, orientation)?)
 }
 
@@ -269,5 +310,24 @@ mod tests {
             Volume::from_fn_u8("dot", [30; 3], |i, j, k| u8::from([i, j, k] == [3, 4, 5]) * 99);
         assert_eq!(box_of(&outline(&dot, &above(50.0), None)), [[3, 4, 5]; 2]);
         assert!(outline(&dot, &above(150.0), None).is_empty());
+    }
+
+    #[test]
+    fn outline_is_read_once_for_each_support_and_crop() {
+        let dot =
+            Volume::from_fn_u8("dot", [30; 3], |i, j, k| u8::from([i, j, k] == [3, 4, 5]) * 99);
+        let source = MemorySource::new(&dot, Digest32::default());
+        let outlines = Outlines::default();
+        let first = outlines.of(&source, 0, &above(50.0), None).unwrap();
+        assert!(Arc::ptr_eq(&first, &outlines.of(&source, 0, &above(50.0), None).unwrap()));
+        let right = "10:,:,:".parse::<slabcast_scene::path::Crop>().unwrap();
+        let right = right.resolve(&dot.lattice).unwrap();
+        assert!(outlines.of(&source, 0, &above(50.0), Some(&right)).unwrap().is_empty());
+        assert!(outlines.of(&source, 0, &above(150.0), None).unwrap().is_empty());
+        for cut in 0..OUTLINES_KEPT {
+            outlines.of(&source, 0, &above(cut as f64), None).unwrap();
+        }
+        assert_eq!(outlines.0.lock().unwrap().len(), OUTLINES_KEPT);
+        assert!(!Arc::ptr_eq(&first, &outlines.of(&source, 0, &above(50.0), None).unwrap()));
     }
 }

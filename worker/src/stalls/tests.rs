@@ -194,3 +194,19 @@ fn end_of_frame_removes_its_stalled_regions() {
     assert!(w.stalls.kept.is_empty() && w.stalls.requested.is_empty());
     assert_eq!((w.stalls.requested_bytes, w.stalls.regions.len()), (0, 0));
 }
+
+#[test]
+fn search_for_room_is_spared_until_a_brick_may_be_dropped() {
+    let mut w = World::new(2);
+    w.enter(1);
+    w.enter(2);
+    w.stalls.stall(key(1), &[0, 1, 2], false);
+    w.stalls.stall(key(2), &[3], false);
+    assert_eq!(w.ask(), [wanted(&[0, 1, 2])], "the oldest goes over the budget");
+    assert_eq!(w.come(&[0, 1, 2]), [key(1)]);
+    assert_eq!(w.ask(), []);
+    assert_eq!(w.stalls.droppable_bytes, 0, "the first region keeps all that is here");
+    w.stalls.remove(key(1), &[0, 1, 2]);
+    assert_eq!(w.stalls.droppable_bytes, 3 * brick(0).encoded_len() as u64);
+    assert_eq!(w.ask(), [forgotten(&[0, 1]), wanted(&[3])]);
+}

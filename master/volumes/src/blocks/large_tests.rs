@@ -93,7 +93,7 @@ fn raw_file_is_read_by_offsets_and_known_the_second_time() {
             calls += 1;
             Ok(())
         };
-        let source = open_source(&path, &Hints::default(), Some(&cache), &mut count).expect("it");
+        let source = open(&path, Some(&cache), Packed::Refused, &mut count).expect("it");
         assert_eq!(calls == before, known, "the sidecar is used");
         assert_eq!(source.levels(), [volume.info(volume.digest())]);
         assert_eq!(whole_level(&*source, 0), volume.samples);
@@ -115,6 +115,51 @@ fn raw_file_is_read_by_offsets_and_known_the_second_time() {
     let text = header.replace("raw", "gzip");
     let all = crate::fuzz::gzip(&bytes[header.len()..]);
     std::fs::write(&packed, [text.as_bytes(), &all].concat()).expect("a file");
-    let e = open_source(&packed, &Hints::default(), None, &mut silent).err().expect("packed");
+    let e = open(&packed, Some(&cache), Packed::Refused, &mut silent).err().expect("packed");
     assert!(e.to_string().contains("slabcast convert"), "{e}");
+}
+
+#[cfg(feature = "zarr")]
+fn open(
+    path: &std::path::Path,
+    cache: Option<&std::path::Path>,
+    packed: Packed,
+    on_progress: &mut ome_zarr::OnProgress<'_>,
+) -> Result<Arc<dyn BlockSource>, crate::OpenError> {
+    open_source(path, &Hints::default(), cache, packed, &mut Vec::new(), on_progress)
+}
+
+#[cfg(feature = "zarr")]
+#[test]
+fn packed_file_is_converted_into_the_cache_once_and_anew_when_it_changes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (path, cache) = (folder.path().join("x.nrrd"), folder.path().join("cache"));
+    let header = "NRRD0004\ntype: ushort\ndimension: 3\nsizes: 70 66 5\nspacings: 1 1 2\n\
+                  endian: little\nencoding: gzip\n\n";
+    let write = |seed: u32| {
+        let numbers = (0..70 * 66 * 5u32).flat_map(|i| ((i * seed % 3001) as u16).to_le_bytes());
+        let all = crate::fuzz::gzip(&numbers.collect::<Vec<u8>>());
+        std::fs::write(&path, [header.as_bytes(), &all].concat()).expect("a file");
+        crate::open(&path).expect("a volume")
+    };
+    let pictures = || {
+        let entries = std::fs::read_dir(cache.join("volumes")).expect("the cache");
+        entries.map(|e| e.expect("an entry").path()).collect::<Vec<_>>()
+    };
+    let volume = write(7);
+    for _ in 0..2 {
+        let source = open(&path, Some(&cache), Packed::Converted, &mut silent).expect("it");
+        assert_eq!((source.name(), source.file_type()), ("x.nrrd", &*volume.file_type));
+        assert_eq!(source.levels()[0].digest, volume.digest());
+        assert_eq!(whole_level(&*source, 0), volume.samples);
+        assert_eq!(pictures().len(), 1);
+    }
+    // A picture that was damaged is made anew.
+    std::fs::remove_file(pictures()[0].join("zarr.json")).expect("its metadata");
+    let source = open(&path, Some(&cache), Packed::Converted, &mut silent).expect("it");
+    assert_eq!(whole_level(&*source, 0), volume.samples);
+    let other = write(11);
+    let source = open(&path, Some(&cache), Packed::Converted, &mut silent).expect("it");
+    assert_eq!(whole_level(&*source, 0), other.samples);
+    assert_eq!(pictures().len(), 2);
 }

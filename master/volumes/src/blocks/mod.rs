@@ -20,6 +20,8 @@ pub mod ome_zarr;
 #[cfg(feature = "zarr")]
 mod open;
 #[cfg(feature = "zarr")]
+mod packed;
+#[cfg(feature = "zarr")]
 mod planes;
 #[cfg(feature = "zarr")]
 mod raw;
@@ -33,7 +35,7 @@ pub use mean::{coarser, halved, halved_lattice, level_lattices};
 pub use memory::MemorySource;
 pub(crate) use memory::copy_box;
 #[cfg(feature = "zarr")]
-pub use open::{is_large, open_source};
+pub use open::{Packed, is_large, open_source};
 #[cfg(feature = "zarr")]
 pub use raw::RawSource;
 

@@ -2,7 +2,7 @@
 
 use super::ome_zarr::{OmeZarrSource, OnProgress};
 use super::raw::RawSource;
-use super::{BlockSource, FormulaSource, MemorySource};
+use super::{BlockSource, FormulaSource, MemorySource, packed};
 use crate::error::{OpenError, Problem};
 use crate::{Hints, formula};
 use std::path::Path;
@@ -15,6 +15,9 @@ use std::sync::Arc;
 /// folder. The first time, that pass takes as long as reading the file, and `on_progress` hears about it.
 /// Our own pyramids have it beside their samples.
 ///
+/// A packed file is converted into `cache` first where `packed` says so. Notes for people are added to
+/// `notes`.
+///
 /// # Errors
 /// A volume of another form, which has to be converted first; one that can't be read or is damaged; or
 /// `on_progress` returned an error.
@@ -22,11 +25,22 @@ pub fn open_source(
     path: &Path,
     hints: &Hints,
     cache: Option<&Path>,
+    packed: Packed,
+    notes: &mut Vec<String>,
     on_progress: &mut OnProgress<'_>,
 ) -> Result<Arc<dyn BlockSource>, OpenError> {
     let shown = path.to_string_lossy();
-    open(path, &shown, hints, cache, on_progress)
+    open(path, &shown, hints, (cache, packed), notes, on_progress)
         .map_err(|problem| OpenError { file: shown.clone().into_owned(), problem })
+}
+
+/// Treatment of files whose samples are packed, so that no part of them can be read by itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Packed {
+    /// Names the command that converts them.
+    Refused,
+    /// Converts them to OME-Zarr in the cache, once. It takes minutes for gigabytes.
+    Converted,
 }
 
 /// Bytes of samples from which a Zarr picture is read by blocks rather than as a whole.
@@ -49,7 +63,8 @@ fn open(
     path: &Path,
     shown: &str,
     hints: &Hints,
-    cache: Option<&Path>,
+    (cache, packed): (Option<&Path>, Packed),
+    notes: &mut Vec<String>,
     on_progress: &mut OnProgress<'_>,
 ) -> Result<Arc<dyn BlockSource>, Problem> {
     if shown.starts_with(FormulaSource::PREFIX) {
@@ -63,12 +78,20 @@ fn open(
     if path.is_dir() && crate::zarr::is_node(path) {
         return Ok(Arc::new(OmeZarrSource::open(path, hints, cache, on_progress)?));
     }
-    match RawSource::open(path, hints, cache, on_progress)? {
-        Some(source) => Ok(Arc::new(source)),
-        None => Err(Problem::unsupported(
-            "content",
-            "can't be read block by block: its samples are packed, or in several files",
-            "convert it with `slabcast convert FILE OUT.ome.zarr`",
-        )),
+    if let Some(source) = RawSource::open(path, hints, cache, on_progress)? {
+        return Ok(Arc::new(source));
     }
+    if packed == Packed::Converted
+        && packed::may_be_converted(path)
+        && let Some(cache) = cache
+    {
+        let (source, told) = packed::open(path, hints, cache, on_progress)?;
+        notes.extend(told);
+        return Ok(Arc::new(source));
+    }
+    Err(Problem::unsupported(
+        "content",
+        "can't be read block by block: its samples are packed, or in several files",
+        "convert it with `slabcast convert FILE OUT.ome.zarr`",
+    ))
 }

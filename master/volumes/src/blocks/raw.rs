@@ -36,7 +36,8 @@ pub struct RawSource {
     stamp: (u64, Option<SystemTime>),
 }
 
-fn stamp(file: &File) -> Result<(u64, Option<SystemTime>), Problem> {
+/// Returns the length of a file and when it was changed.
+pub(super) fn stamp(file: &File) -> Result<(u64, Option<SystemTime>), Problem> {
     let meta = file.metadata().map_err(|e| Problem::io("file", &e))?;
     Ok((meta.len(), meta.modified().ok()))
 }
@@ -173,14 +174,33 @@ fn identity(
 ) -> Result<Identity, Problem> {
     let mut hash = Sha256::new();
     hash.update(b"slabcast raw 1");
+    hash.update(start.to_le_bytes());
+    hash.update([u8::from(endian == Endian::Big)]);
+    ends(file, (len, changed), &mut hash)?;
+    describe(planes, &mut hash);
+    Ok(hash.finalize().into())
+}
+
+/// Adds a file's length, time and ends to a hash.
+///
+/// # Errors
+/// The file can't be read.
+pub(super) fn ends(
+    file: &File,
+    (len, changed): (u64, Option<SystemTime>),
+    hash: &mut Sha256,
+) -> Result<(), Problem> {
     let since = changed.and_then(|t| t.duration_since(UNIX_EPOCH).ok());
-    for n in [len, start, u64::from(endian == Endian::Big)] {
-        hash.update(n.to_le_bytes());
-    }
+    hash.update(len.to_le_bytes());
     hash.update(since.map_or(0, |t| t.as_nanos()).to_le_bytes());
     for at in [0, len.saturating_sub(ENDS_BYTES)] {
         hash.update(read_at(file, at, ENDS_BYTES.min(len - at) as usize)?);
     }
+    Ok(())
+}
+
+/// Adds what a header says to a hash.
+pub(super) fn describe(planes: &Planes, hash: &mut Sha256) {
     let (lattice, map) = (planes.lattice, planes.rescale);
     hash.update(planes.number.name());
     hash.update([planes.anatomical.into()]);
@@ -188,5 +208,4 @@ fn identity(
     let steps = lattice.steps.iter().flat_map(|s| s.to_array());
     let numbers = steps.chain(lattice.origin.to_array()).chain([map.scale, map.offset]);
     numbers.for_each(|x| hash.update(x.to_le_bytes()));
-    Ok(hash.finalize().into())
 }

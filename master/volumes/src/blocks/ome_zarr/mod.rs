@@ -6,7 +6,7 @@ mod source;
 mod write;
 
 pub use convert::{Converted, OnProgress, convert};
-pub(crate) use convert::{blocks_again, infos, walk};
+pub(crate) use convert::{blocks_again, infos, walk, write as write_pyramid};
 pub use source::{OmeZarrSource, level_sizes};
 pub(crate) use write::{LevelWriter, packed};
 

@@ -249,6 +249,11 @@ pub(super) fn complete(folder: &Path, unfinished: Unfinished) -> Result<Facts, P
 }
 
 impl OmeZarrSource {
+    /// Calls the volume by another name and number type than those of the folder.
+    pub(crate) fn named(self, name: &str, file_type: &str) -> OmeZarrSource {
+        OmeZarrSource { name: name.into(), file_type: file_type.into(), ..self }
+    }
+
     /// Opens a pyramid or an array in a folder. What is known of its blocks comes from the sidecar in
     /// its folder or in `cache`; without one, all samples are read once, which `on_progress` hears
     /// about, and a sidecar is put into `cache`.

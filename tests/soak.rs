@@ -265,7 +265,7 @@ fn keep_worker(world: &World, number: u64) -> Process {
                     worker.signal("-KILL");
                     break;
                 }
-                // What it held when it was stopped it holds when it is killed.
+                // A stopped worker still holds its leases when it is killed.
                 7 => {
                     world.count("kills");
                     worker.signal("-STOP");
@@ -382,7 +382,7 @@ async fn run_job<'a>(
             Ok(())
         }
         20..25 => {
-            // The same request again is the same job, and has any number of watchers.
+            // A repeated request is the first one's job, which may have any number of watchers.
             let again = client.submit(&request).await?;
             if again != job.id {
                 world.fail("error: second job", &format!("{} and {again}", job.id));

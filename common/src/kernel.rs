@@ -110,7 +110,7 @@ impl Profile {
     /// 1 for frequency 0. `frequency` in cycles per vox.
     pub fn transform_at(&self, frequency: f64) -> f64 {
         let splines = match self.kernel {
-            // Of a B-spline: a power of sinc.
+            // The transform of a B-spline is a power of sinc.
             Kernel::Bspline | Kernel::Interpolating => Some((4, 0.5 * self.radius)),
             Kernel::Tent => Some((2, self.radius)),
             Kernel::Gaussian => None,
@@ -136,7 +136,7 @@ impl Profile {
     /// Returns the integral of g from -radius to `u` vox: 0 to 1.
     pub fn integral_to(&self, u: f64) -> f64 {
         let u = u.clamp(-self.radius, self.radius);
-        // What lies between the middle and `t` steps of a spline.
+        // Integral of a spline from its middle to `t` steps.
         let half = |t: f64| match self.kernel {
             Kernel::Tent => t * (1.0 - 0.5 * t),
             _ if t < 1.0 => t * (2.0 / 3.0 + t * t * (0.125 * t - 1.0 / 3.0)),
@@ -253,8 +253,7 @@ impl Front {
     /// Returns the centroid between this plane and one behind it.
     fn to(&self, back: &Front) -> f64 {
         let weight = back.weight - self.weight;
-        // Of less than this there is nothing to be seen, and cancellation is all that there is of
-        // its moment.
+        // Less weight than this is invisible, and its moment is only cancellation.
         if weight < 1e-9 {
             return 0.5 * (self.at + back.at);
         }
@@ -265,9 +264,9 @@ impl Front {
 /// Shear of a kernel against the eye's axes. The head of this file has the formulas.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Lean {
-    /// How far the kernel's middle moves along x and y for each vox of depth.
+    /// Distance that the kernel's middle moves along x and y for each vox of depth.
     pub depth: [f64; 2],
-    /// How far the middle of a row moves along x for each vox of y.
+    /// Distance that the middle of a row moves along x for each vox of y.
     pub row: f64,
 }
 

@@ -35,7 +35,7 @@ pub enum Classify {
     Before,
 }
 
-/// How the sheets of a pixel are composited.
+/// Rule by which the sheets of a pixel are composited.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Compositing {
@@ -341,7 +341,7 @@ pub struct Keep {
     pub gradients: bool,
 }
 
-/// How the work of a job is cut and scheduled. Never changes a byte.
+/// Schedule and division of the work of a job. Never changes a byte.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Work {

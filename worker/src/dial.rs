@@ -113,7 +113,7 @@ pub async fn run_with(
                         warn!(master, reason, "link lost, dialling again");
                         told = false;
                     }
-                    // What answers there may be no master, and then each try ends so.
+                    // The address may not be a master's; then every attempt ends this way.
                     Ended::Lost(reason) => {
                         if !std::mem::replace(&mut told, true) {
                             warn!(
@@ -256,7 +256,7 @@ async fn carry(
     control: mpsc::UnboundedSender<ToWorker>,
     bricks: mpsc::Sender<convert::Bricks>,
 ) -> Result<(), Broken> {
-    // How results are compressed, by the frame that came last.
+    // Whether results are sent uncompressed, as the last frame asked.
     let uncompressed = Arc::new(AtomicBool::new(false));
     // Encoded on this runtime thread: handing a message to another thread and back takes some 25
     // us (docs/design/transport.md section 0), and the message of a 64x64 tile 35 us. Of the

@@ -1,4 +1,4 @@
-//! How much of a worker's memory its bricks may take.
+//! Share of a worker's memory that its bricks may take.
 //!
 //! `--memory` is for the whole process, since that is what a control group or a full machine kills.
 //! So bricks are counted by the bytes that they take in memory, not by their encoded ones, and get what
@@ -48,7 +48,7 @@ pub fn encoded_share(limit_bytes: u64, threads: u32) -> u64 {
 /// Returns the encoded bytes of bricks that may be here with `bricks_bytes` of memory for them, of
 /// which `encoded` are here and take `resident` bytes.
 pub(crate) fn encoded_budget(bricks_bytes: u64, encoded: u64, resident: u64) -> u64 {
-    // Of few bricks the relation is chance.
+    // With few bricks the ratio is chance.
     if resident < LEAST_BRICKS_BYTES / 16 {
         return bricks_bytes / BYTES_AN_ENCODED;
     }
@@ -85,7 +85,7 @@ mod tests {
         assert_eq!(encoded_share(512 * MIB, 2), room / 3);
         assert_eq!(least_bytes(2), (24 + 2 * 6 + 16) * MIB);
         assert_eq!(bricks_bytes(least_bytes(2), 2), LEAST_BRICKS_BYTES);
-        // Of a large limit nearly all.
+        // Bricks get nearly all of a large limit.
         assert!(bricks_bytes(16 << 30, 8) > 14 << 30);
     }
 

@@ -42,8 +42,8 @@ const DRAIN: Duration = Duration::from_secs(8);
 /// much longer. A link of less than 200 kb/s can't bring a batch in this time.
 const BRICKS_OVERDUE: Duration = Duration::from_secs(3);
 
-/// How often a worker looks whether bricks are overdue. It counts looks and not time, so that a
-/// process that was stopped does not blame its master.
+/// Number of looks for bricks in [`BRICKS_OVERDUE`]; after so many in vain, bricks are overdue. A
+/// worker counts looks and not time, so that a process that was stopped does not blame its master.
 const LOOKS: u32 = 12;
 
 /// Longest time that a master may take to answer the hello.

@@ -232,7 +232,7 @@ impl Stalls {
             // No regions: the schedule is `slab`, and the master keeps this worker's budget.
             return requests;
         }
-        // Of sets without a directory nothing is drawn, and their bricks go first.
+        // Sets without a directory are not drawn, so their bricks are dropped first.
         self.last_used.retain(|set, _| cache.table(*set).is_some());
         // Bricks that came without being asked for may exceed the budget, too.
         self.make_room(cache, 0, true, &mut requests);

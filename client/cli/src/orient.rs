@@ -33,7 +33,7 @@ fn guesses() -> Vec<Orientation> {
 /// The picture can't be drawn or written.
 pub(crate) fn draw(volume: &Volume, info: &VolumeInfo, path: &Path) -> Result<(), Fail> {
     let size = [EDGE; 2];
-    // What all six sides need, so that no guess is cut off.
+    // One framing for all six sides, so that no guess is cut off.
     let sides = Side::NAMES.map(|(_, side)| Key { view: Some(side), ..Key::default() });
     let keys = KeyFrames {
         frames: 6,

@@ -20,7 +20,7 @@ use std::ops::Deref;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// How a picture is cut for threads; never changes a byte.
+/// Division of a picture among threads; never changes a byte.
 #[derive(Clone, Copy, Debug)]
 pub struct Cut {
     /// Number of threads that draw at once.

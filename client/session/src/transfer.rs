@@ -231,7 +231,7 @@ impl Transfer {
         match (self.function(info), &self.base) {
             (Ok(tf), TransferChoice::Function(_)) => TransferChoice::Function(Box::new(tf)),
             (Ok(tf), _) if changed => TransferChoice::Function(Box::new(tf)),
-            // What can't be made is refused by the master in the words of `fit`.
+            // A function that can't be made is refused by the master with the error of `fit`.
             _ => self.base.clone(),
         }
     }

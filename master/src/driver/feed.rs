@@ -439,7 +439,7 @@ mod tests {
         let used = Room { reserved: 20, ..full };
         assert_eq!(places(&used, true, true, 5), (false, true));
         assert_eq!(places(&used, true, true, 6), (false, false), "others use it");
-        // What is in the reserve holds up no frame that is larger than the budget.
+        // Bytes in the reserve don't hold up a frame that is larger than the budget.
         let alone = Room { reserved: 20, ..Room::default() };
         assert_eq!(places(&alone, true, true, 1 << 40), (true, false));
     }

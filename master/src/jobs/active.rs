@@ -30,7 +30,7 @@ pub(crate) struct ActiveJob {
     pub(crate) views: Views,
     /// The next frame that was never rendered, or one before it.
     pub(crate) next: u64,
-    /// How many frames of it were begun, those that were rendered again included.
+    /// Number of frames that were begun, repeated ones included.
     pub(crate) begun: u64,
 }
 

@@ -36,7 +36,7 @@ impl Numbers {
         self.words.get(n as usize / 64).is_some_and(|word| word & (1 << (n % 64)) != 0)
     }
 
-    /// How many numbers are in the set.
+    /// Returns the number of numbers in the set.
     pub(crate) fn len(&self) -> u64 {
         self.len
     }

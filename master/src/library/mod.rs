@@ -766,7 +766,7 @@ fn list_files(folder: &Path) -> std::io::Result<BTreeMap<String, Stamp>> {
         if name.starts_with('.') || name.chars().any(char::is_control) {
             continue;
         }
-        // Of what a link points to.
+        // Follows links.
         let Ok(about) = std::fs::metadata(found.path()) else { continue };
         let lower = name.to_ascii_lowercase();
         let is_volume = about.is_dir() || endings().any(|e| lower.ends_with(e));

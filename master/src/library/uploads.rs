@@ -218,7 +218,7 @@ impl Uploads {
             let why = format!("chunk: ends at byte {end}, and there are {}", part.total);
             return Err(VolumeError::Choose(why));
         }
-        // What is there already, or comes too early, is not written.
+        // Bytes that are there already, or that leave a gap, are not written.
         if offset <= part.received && end > part.received {
             let new = &data[(part.received - offset) as usize..];
             if let Err(e) = part.file.write_all(new) {

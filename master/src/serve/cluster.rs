@@ -325,7 +325,7 @@ async fn control(
                 }
             }
         }
-        // What was said last still leaves.
+        // The last messages are still sent.
         drop(messages);
         std::future::pending::<()>().await;
     };

@@ -53,7 +53,7 @@ pub(crate) fn counted_as(ip: IpAddr) -> IpAddr {
     }
 }
 
-/// How much of something each address has.
+/// Counts of some resource by address.
 #[derive(Default)]
 pub(super) struct Counts(Mutex<BTreeMap<IpAddr, usize>>);
 

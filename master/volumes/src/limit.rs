@@ -1,4 +1,4 @@
-//! How many bytes of samples a file may become before somebody is asked.
+//! Limit on the bytes of samples that a file may become without `--max-bytes`.
 //!
 //! A size in a header is checked against the bytes that are there ([`crate::samples::Supply`]), so
 //! no header lies for long. But a file of 8 MB may say honestly that it becomes 8 GiB: zeros shrink

@@ -1,6 +1,6 @@
 //! Converts a file's numbers, of any type and byte order, to [`Samples`].
 //!
-//! How each type is kept:
+//! The codes of each type:
 //!
 //! | file | codes | value of code c |
 //! |---|---|---|

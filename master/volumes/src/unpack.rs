@@ -8,7 +8,7 @@ use crate::samples::{Number, Supply};
 use crate::source::Notes;
 use std::io::{BufRead, Read};
 
-/// How samples are encoded.
+/// Encoding of samples.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Encoding {
     Raw,

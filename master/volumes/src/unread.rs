@@ -4,7 +4,7 @@
 use crate::error::{FLAT_REMEDY, OpenErrorKind, Problem};
 use crate::pictures;
 
-/// How a format is recognised.
+/// Mark by which a format is recognised.
 enum Mark {
     /// The file begins with these bytes.
     Begins(&'static [u8]),

@@ -35,7 +35,7 @@ pub(crate) fn compact_integers<T: Wide + Ord + Into<i128>>(
         if exact {
             return Ok((Samples::U16(convert(pieces, code)?), map));
         }
-        // How far f64s lie apart there.
+        // Half the distance of neighbouring f64s at these sizes, at least 1.
         beside.rounded::<T>((min.abs().max(max.abs()) as f64 * f64::EPSILON / 2.0).max(1.0));
         return Ok((Samples::U16(convert_beside(pieces, map, beside, code)?), map));
     }

@@ -132,14 +132,14 @@ pub fn type_note(volume: &Volume, numbers: Option<&FileNumbers>, format: Format)
     Some(format!("the file has {from}, and {to} is written, {why}"))
 }
 
-/// How the file's own numbers are written.
+/// Form in which the file's own numbers are written.
 #[derive(Clone, Copy, PartialEq)]
 enum Own {
     Numbers,
     Values,
 }
 
-/// How samples are written: their type, and the maps from code to number and number to value.
+/// Form of written samples: their type, and the maps from code to number and from number to value.
 struct NumberForm {
     number: Number,
     /// Whether the file's own numbers are written: as they are, or as values.

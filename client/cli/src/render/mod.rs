@@ -292,7 +292,7 @@ fn served(
     let volume = args.input.open(volume)?;
     let orientation = args.scene.view.axes.for_volume(&volume)?;
     let name = (volume.name.as_str(), false);
-    // Of what the master has, not a byte is sent and nothing said.
+    // Nothing is sent and no progress is shown if the master has the volume already.
     let mut sending = None;
     let told = |there, total| {
         if there < total || sending.is_some() {

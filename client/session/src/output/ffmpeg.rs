@@ -140,7 +140,7 @@ impl Encoder {
         let mut stderr = child.stderr.take().expect("piped above");
         let said = std::thread::spawn(move || {
             let mut bytes = Vec::new();
-            // What can't be read is not said.
+            // A message that can't be read is left out.
             let _ = stderr.by_ref().take(1 << 16).read_to_end(&mut bytes);
             let _ = std::io::copy(&mut stderr, &mut std::io::sink());
             String::from_utf8_lossy(&bytes).into_owned()
@@ -192,7 +192,7 @@ impl Encoder {
 }
 
 impl Drop for Encoder {
-    /// Of a run that failed nothing stays: neither process nor file.
+    /// Ends the process and removes the file of a run that failed.
     fn drop(&mut self) {
         if self.file.is_some() {
             let _ = self.child.kill();

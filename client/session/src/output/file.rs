@@ -23,7 +23,7 @@ pub(super) fn hidden(folder: &Path, name: &str) -> Result<NamedTempFile> {
     let prefix = format!(".{name}.");
     builder.prefix(&prefix).suffix(".tmp");
     #[cfg(unix)]
-    // What the umask leaves, as for any file of the user's; the crate's own choice is 0600.
+    // The umask decides, as for any file of the user; the crate's own choice is 0600.
     builder.permissions(<Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666));
     builder.tempfile_in(folder)
 }

@@ -269,7 +269,7 @@ mod tests {
             (folder.path.file_name().unwrap().to_str().unwrap().to_string(), note)
         };
         assert_eq!(look(false, false), ("out".into(), None));
-        // What is no frame is not in the way.
+        // Files that are not frames don't count.
         std::fs::create_dir(&own).unwrap();
         std::fs::write(own.join("notes.txt"), "").unwrap();
         assert_eq!(look(false, false), ("out".into(), None));

@@ -183,7 +183,7 @@ pub struct Output {
     /// Marks over the pictures, and their dots an inch.
     pub figure: Figure,
     background: Background,
-    /// How frames that arrive as small pictures of floats are magnified.
+    /// Magnification of frames that arrive as small pictures of floats; `None` for others.
     magnify: Option<Magnify>,
 }
 

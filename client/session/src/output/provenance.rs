@@ -121,7 +121,7 @@ impl Provenance {
 
     /// Returns the provenance as JSON for a picture's file, or for that of a moving picture.
     pub(super) fn written(mut self, frame: &Frame) -> String {
-        // Of a single frame, that does not say it in another way.
+        // Only for a single frame without a hash of its linear pixels.
         if self.view_sha256.is_some() && self.pixels_sha256.is_none() {
             self.picture_sha256 = Some(Digest32(Sha256::digest(&frame.bytes).into()).to_string());
         }

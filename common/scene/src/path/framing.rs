@@ -187,7 +187,7 @@ fn fit(shots: &[Shot], points: &[[u32; 3]], lattice: &Lattice, size: [u32; 2]) -
             let distance = shot.tan.filter(|_| round > 0).map(|tan| half_height / tan);
             let (mut lo, mut hi) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
             for p in shot.project(points, centre, target) {
-                // As large as it looks at the target's depth.
+                // Scaled by perspective to its size at the target's depth.
                 let p = p * distance.map_or(1.0, |d| d / (d + p.z));
                 (lo, hi) = (lo.min(p), hi.max(p));
             }

@@ -386,13 +386,14 @@ impl ViewPath {
         assert!((first..first + self.frames()).contains(&number), "frame {number}");
         let one = ViewPath { range: None, ..self.clone() };
         match self.turntable {
-            // What `camera` adds up for this frame; nothing is added to it for the first.
+            // The azimuth that `camera` computes for this frame becomes the start of a turntable of
+            // one frame.
             Some(t) => {
                 let start = t.start + t.step * number as f64;
                 ViewPath { turntable: Some(Turntable { start, frames: 1, ..t }), ..one }
             }
             None if !self.views.is_empty() => ViewPath { views: vec![self.views[number]], ..one },
-            // What lies between keys hangs on all of them.
+            // A frame between keys depends on all of them.
             None => ViewPath { range: Some([number as u32; 2]), ..one },
         }
     }

@@ -264,8 +264,8 @@ fn deepest(counts: &[(f64, f64)], among: usize) -> Option<usize> {
     best.map(|(_, at)| at)
 }
 
-/// As far from the air in front of a valley as from what is behind: its lowest bin may be anywhere
-/// on a flat floor.
+/// Returns the middle bin of the floor of a valley, whose lowest bin may be anywhere on the floor.
+/// `counts` are bins with their counts; `lowest` is the index of the lowest.
 fn middle_of_floor(counts: &[(f64, f64)], lowest: usize) -> usize {
     let floor = |t: &&(f64, f64)| t.1 <= FLOOR * counts[lowest].1;
     let before = counts[..lowest].iter().rev().take_while(floor).count();
@@ -365,7 +365,7 @@ mod tests {
 
     #[test]
     fn background_above_zero_counts_as_air() {
-        // As in a tooth's scan: background about 77, dark streaks below it.
+        // A tooth's scan: background about 77, dark streaks below it.
         let l = levels(bytes(&[
             (0, 70, 200),
             (72, 83, 60_000),
@@ -398,8 +398,8 @@ mod tests {
 
     #[test]
     fn air_ends_where_noise_meets_the_body() {
-        // As in a series of MR slices: noise falls off to a twentieth of its peak, and no further
-        // before tissue rises.
+        // A series of MR slices: noise falls off to a twentieth of its peak, and no further before
+        // tissue rises.
         let noise = (0..14).map(|i| (i, i + 1, 50_000 >> (i / 3)));
         let floor = [(14, 40, 26 * 3_000)];
         let tissue = (40..80).map(|i| (i, i + 1, 12_000 - 400 * 20u32.abs_diff(i - 40)));

@@ -45,7 +45,7 @@ pub(crate) struct Lease {
     deadline: Option<Micros>,
 }
 
-/// How a task ended.
+/// End of a task.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum End {
     /// No result yet.
@@ -58,7 +58,7 @@ pub(crate) enum End {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Failure {
     pub(crate) who: Arc<WorkerIdentity>,
-    /// How often.
+    /// Number of failures.
     pub(crate) times: u32,
     /// Reason the worker gave when it refused the task last; `None` if its link was lost instead.
     pub(crate) said: Option<String>,
@@ -75,7 +75,7 @@ pub(crate) struct Task {
     queued: Option<i64>,
     /// Workers that were lost with it or refused it, each once.
     pub(crate) failures: Vec<Failure>,
-    /// How often a worker was lost that was probably running it.
+    /// Number of times that a worker was lost while it was probably running the task.
     blamed: u32,
     /// While it waits after a failure: until when only the likeliest workers may try it.
     choosy_until: Option<Micros>,
@@ -130,12 +130,12 @@ impl Task {
         self.audit.as_ref()
     }
 
-    /// How often a worker failed at it.
+    /// Returns the number of times that workers failed at the task.
     pub(crate) fn tries(&self) -> u32 {
         self.failures.iter().fold(0, |sum, f| sum.saturating_add(f.times))
     }
 
-    /// Whether a worker failed at it, on this link or an earlier one.
+    /// Returns whether a worker failed at the task, on this link or an earlier one.
     pub(crate) fn was_failed_by(&self, who: &WorkerIdentity) -> bool {
         self.failures.iter().any(|f| *f.who == *who)
     }
@@ -669,7 +669,7 @@ mod tests {
         q.lease(5, WorkerId(2), 0, &c);
         assert_eq!(same(&q, &[5, 2, 4], &[2]), Some(4));
         assert_eq!(same(&q, &[5, 2], &[2]), None);
-        // What comes back is before all others, the last one first.
+        // Tasks that come back are ahead of all others, the last one first.
         lose(&mut q, 2, &[(5, Epoch(0))], 0, 0);
         q.share_queued(&[2]);
         assert_eq!(q.all_waiting().collect::<Vec<_>>(), [2, 5, 0, 1, 3, 4]);

@@ -61,7 +61,7 @@ const DEPTH_MAX: u32 = 64;
 /// Length of an element that a delimiter ends.
 pub(super) const UNDEFINED: u32 = u32::MAX;
 
-/// How pixels are stored.
+/// Storage of pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Pixels {
     /// Uncompressed.
@@ -75,7 +75,7 @@ pub(super) enum Pixels {
     Packed(Packing),
 }
 
-/// How pixels in fragments are encoded.
+/// Encoding of pixels in fragments.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Packing {
     /// Run lengths.
@@ -104,7 +104,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
     head.get(128..132) == Some(b"DICM") || bare && head.len() > 8
 }
 
-/// How elements are encoded: with or without their types, and in which byte order.
+/// Encoding of elements: with or without their types, and the byte order.
 #[derive(Clone, Copy)]
 pub(super) struct Syntax {
     explicit: bool,

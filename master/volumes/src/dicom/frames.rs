@@ -221,7 +221,7 @@ fn fragments(rest: &mut dyn Read, start: u64, count: usize) -> Result<Vec<(u64, 
     rest.take(bytes.into()).read_to_end(&mut table).map_err(|e| Problem::io("PixelData", &e))?;
     at += 8 + u64::from(bytes);
     let first = at;
-    // Where items begin, and where the last one ends.
+    // Offset of each item, and the end of the last one.
     let mut items = vec![first];
     while let Some(bytes) = next(rest)? {
         match crate::source::skip_bytes(rest, bytes.into()) {

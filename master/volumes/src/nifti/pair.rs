@@ -51,7 +51,7 @@ pub(crate) fn read(
     let data = data_beside(folder, name)?.ok_or_else(|| no_data(name, nifti, magic))?;
     let mut header = Header::fields(bytes, endian);
     if !nifti {
-        // What ANALYZE keeps in their places has another meaning.
+        // ANALYZE has fields of another meaning in the places of these.
         (header.qform_code, header.sform_code, header.inter, header.units) = (0, 0, 0.0, 2);
     }
     let (layout, part, said) = header.layout(endian, pick).map_err(|p| match nifti {

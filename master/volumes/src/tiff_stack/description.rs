@@ -210,7 +210,7 @@ fn ome(text: &str, pixels: &str) -> Result<Description, Problem> {
     // OME names the fastest axis first.
     description.axes = letters.chars().rev().map(|c| (axis_name(c, 0), size(c))).collect();
     let several = size('C').saturating_mul(size('T')) > 1;
-    // Where the pages of channels and times are told one by one, they must be in that order.
+    // If the file lists the pages of channels and times one by one, they must be in that order.
     for data in elements(text, "TiffData").filter(|_| several) {
         let (mut index, mut step) = (0u64, 1u64);
         for c in letters.chars() {

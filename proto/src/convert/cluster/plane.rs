@@ -1,6 +1,7 @@
 //! Planes of a tile, exact to the bit and without what is blank.
 //!
-//! How should a tile's opacity, colour and sums cross? Uncompressed they take 32 bytes a pixel, 2
+//! In which form should a tile's opacity, colour and sums cross? Uncompressed they take 32 bytes a
+//! pixel, 2
 //! MiB a full tile. A general compressor would find the blank pixels too, at some 20 us for 16 KiB
 //! (docs/design/transport.md section 6). Here the data is known: a pixel that no voxel touched is
 //! zero in all its words, and in many tiles that is most of them. One bit a pixel says so, at the

@@ -337,7 +337,8 @@ impl Sifting {
         due
     }
 
-    /// Of `n` pixels `none` had nothing.
+    /// Notes that `none` of `n` pixels had nothing to composite; sifting rests if that is too few
+    /// to pay.
     #[inline(always)]
     fn found(&mut self, none: usize, n: usize) {
         if none * Sifting::PAYS < n {
@@ -381,7 +382,7 @@ impl<S: Recorded> Closes<S> {
         for i in (0..places.len()).step_by(LANES) {
             let places = places.from(i);
             take::<S, N>(simd, (&mut *records, &mut *before), &pixels.all, places, slot, &mut row);
-            // Where rays are parallel, the row's secants stay 1.
+            // With parallel rays, the row's secants stay 1.
             if let Projection::Persp { .. } = part.frame.view.projection {
                 for (lane, &at) in places.at().iter().enumerate() {
                     row.secant[lane] = pixels.secants[at as usize];
@@ -410,7 +411,7 @@ impl<S: Recorded> Closes<S> {
     fn begin_sheet(&mut self, closing: &Rows, touched: &Rows) {
         let Closes { before, was, .. } = self;
         for (y, (closing, was)) in closing.iter().zip(&*was).enumerate() {
-            // Where this sheet has something and the one before had nothing.
+            // Pixels at which this sheet has something and the one before had nothing.
             let mut fresh = closing & !was;
             while fresh != 0 {
                 let x = fresh.trailing_zeros();

@@ -68,7 +68,7 @@ pub struct Part<'a> {
     pub(crate) tile: Rect,
     pub(crate) slab: SheetRange,
     pub(crate) bricks: BrickSource<'a>,
-    /// Of [`BrickSource::Here`]: indices of the bricks that lie over the part, front to back.
+    /// Indices of the bricks of [`BrickSource::Here`] that lie over the part, front to back.
     pub(crate) inside: &'a [u32],
 }
 

@@ -31,12 +31,13 @@ const GRAZING: f64 = 0.01;
 /// 1/2048 vox changes a pixel by 0.03; sub-steps may cost 0.05. In 1/255.
 const VALUES: f64 = 0.1;
 
-/// How far a turned B-spline moves a ramp, in vox: its first moment has waves with the period of the
-/// lattice. 0.054 was the largest seen; the limit has them too.
+/// Bound on the distance by which a turned B-spline moves a ramp, in vox: its first moment has
+/// waves with the period of the lattice. 0.054 was the largest seen; the limit of thin sheets has
+/// these waves, too.
 const TURNED_RAMP: f64 = 0.06;
 
-/// How much of its light a lit ramp may lose or gain by these waves, whose slope turns the normal by
-/// 0.7 degrees. In 1/255.
+/// Bound on the light that a lit ramp loses or gains by the waves of [`TURNED_RAMP`], in 1/255:
+/// their slope turns the normal by 0.7 degrees.
 const TURNED_LIGHT: f64 = 2.0;
 
 /// Steps of the closed forms' own integrals.
@@ -243,8 +244,8 @@ fn ramp(name: &'static str, opacities: &'static [[f64; 2]], lit: bool) -> Case {
     })
 }
 
-/// How much a pixel may change, as a share of full light, where the ramp moves by one vox: by the
-/// extinction of a jump, or by the colour, which goes from end to end in 16 vox.
+/// Returns a bound on the change of a pixel, as a share of full light, if the ramp moves by one
+/// vox: by the extinction of a jump, or by the colour, which goes from end to end in 16 vox.
 fn slope(points: &[[f64; 2]]) -> f64 {
     let jump = points[0][0] == points[1][0];
     f64::max(if jump { points[1][1] } else { 0.0 }, 1.0 / 16.0)

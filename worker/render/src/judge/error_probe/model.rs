@@ -419,7 +419,8 @@ fn waves(view: &View, profile: &[Profile; 3], radius: [f64; 3]) -> Vec<Wave> {
     for k in -2..=2 {
         for j in -2..=2 {
             for i in -2..=2 {
-                // Of a wave and the opposite one, the first that is not zero is positive.
+                // One of each pair of opposite waves: its first component that is not zero is
+                // positive.
                 if [k, j, i].into_iter().find(|&n| n != 0).is_none_or(|n| n < 0) {
                     continue;
                 }

@@ -177,8 +177,8 @@ impl Reference {
     }
 
     /// Returns the limit at pixel (x, y), counted from the top left: linear premultiplied RGBA.
-    /// Where values are classified after reconstruction it is [`FieldReference`]'s; sheets and
-    /// ideals of this reference are those of `before` all the same.
+    /// With classification after reconstruction, [`FieldReference`] computes it. Sheets and ideals
+    /// of this reference are for classification before reconstruction even then.
     pub fn pixel(&self, x: u32, y: u32) -> [f64; 4] {
         if let Some(field) = &self.field {
             return field.pixel(x, y);

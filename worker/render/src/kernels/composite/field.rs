@@ -397,7 +397,7 @@ impl FieldRule {
             outside |= (q < faces.lo) | (q > faces.hi);
             let [lo, lo_slope] = beside_face(table, q - faces.lo);
             let [hi, hi_slope] = beside_face(table, faces.hi - q);
-            // What lies beyond either face is missing: exact however thin the volume is.
+            // The weight beyond both faces is missing; this is exact however thin the volume is.
             let weight = (lo - (1.0 - hi)).max(LEAST_WEIGHT);
             let slope = (lo_slope - hi_slope) / weight;
             plane.value /= weight;
@@ -544,7 +544,8 @@ impl FieldRule {
         if (high <= scene.visible[0]) | (low >= scene.visible[1]) | (to <= from) {
             return;
         }
-        // How many sub-steps: by the light, and by how far value and gradient change.
+        // The number of sub-steps follows from the light, and from the change of value and
+        // gradient.
         let most = h * scene.most[scene.cell(high).0 + 1];
         let share = (1.0 - row.a[i]) * if most < 1.0 { most } else { 1.0 };
         let flat = self.flat * self.flat;

@@ -89,7 +89,7 @@ unsafe fn make_ready<L: Lanes>(
 ) {
     let Tossing { at: [x, y, z], cells, samples, normals, ready, .. } = tossing;
     for i in (0..kept).step_by(L::LANES) {
-        // Of 512 each, as many begin here.
+        // Each array has 512 entries, of which a whole vector lies from `i` on.
         let ready = &mut ready[i..i + L::LANES];
         // SAFETY: as the line above shows; a voxel that is ready is four numbers.
         unsafe {

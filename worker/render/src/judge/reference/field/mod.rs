@@ -315,7 +315,7 @@ impl FieldReference {
         }
         let [unseen, jump] = self.hidden(&parts, h * of.secant);
         off = off.max(jump * JUMP);
-        // Where nearly nothing was seen yet, a share of it would be less than any picture needs.
+        // While nearly nothing is visible, a share of it would be less than any picture needs.
         let opacity = -libm::expm1(-(sum.depth + depth));
         let one_vox = -libm::expm1(-self.looks.sigma_max.min(1.0));
         let agree = open * off <= self.tolerance * opacity.max(FAINT * one_vox)
@@ -333,8 +333,8 @@ impl FieldReference {
         }
     }
 
-    /// How much opacity or light a panel of `length` vox can hide because f passes a bend of the
-    /// transfer function: where it looks there as at no node, and where it jumps.
+    /// Returns bounds on the opacity or light that a panel of `length` vox can hide because f
+    /// passes a bend of the transfer function: by a look that no node has, and by a jump.
     fn hidden(&self, parts: &[Part; 2], length: f64) -> [f64; 2] {
         let (n, nodes) = (8, [&parts[0].nodes, &parts[1].nodes]);
         let node = |i: usize| &nodes[i / 4][i % 4];

@@ -493,7 +493,7 @@ unsafe fn close<L: Floats>(
             return 0;
         }
 
-        // How many sub-steps each takes.
+        // Number of sub-steps of each lane.
         let (ends, _) = cell::<L>(high);
         let top = L::look_up(L::marks(visible), scene.most.as_ptr().add(1).cast(), ends);
         let top = L::least(L::mul(L::all(h), L::from_bits(top)), one);

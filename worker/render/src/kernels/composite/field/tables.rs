@@ -57,9 +57,9 @@ impl GradientShares {
     }
 }
 
-/// How far below the smallest code the background lies where the smallest and the largest are visible,
-/// in shares of all codes. It costs sums this share of their precision; a constant volume needs more
-/// than nothing.
+/// Distance of the background below the smallest code, as a share of all codes, if both the
+/// smallest and the largest code are visible. It costs sums this share of their precision; a
+/// constant volume needs more than nothing.
 const BELOW: f64 = 1.0 / 64.0;
 
 /// Values of a scene: how codes become sums, and what values look like.
@@ -210,7 +210,7 @@ fn hull(classifier: &Classifier, summary: &ValueSummary, ends: [f64; 2]) -> [f64
     // The transfer function is linear between codes: of whole codes it begins to show within one.
     let beside = if summary.kind == SampleKind::F32 { 0.0 } else { 1.0 };
     let clamp = |code: f64| code.clamp(summary.min_code, summary.max_code);
-    // What is beyond a visible end looks like it.
+    // Values beyond a visible end look like the end.
     let lo = if lo <= summary.min_code { ends[0] } else { clamp(lo - beside) };
     let hi = if hi >= summary.max_code { ends[1] } else { clamp(hi + beside) };
     if hi > lo { [lo, hi] } else { [lo, lo + span(summary)] }

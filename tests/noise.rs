@@ -1,5 +1,5 @@
-//! Links on which bits flip, links that swallow bricks, and a worker that says too much: pixels stay
-//! true, nothing hangs, and nobody else waits.
+//! Links on which bits flip, links that swallow bricks, and a worker that says too much: pixels
+//! stay true, nothing hangs, and nobody else waits.
 //!
 //! A proxy stands between a master and its worker, and between the master and a client. The
 //! campaign of a hundred thousand flips in each direction runs at night (`tests/nightly.sh flips`).
@@ -395,8 +395,8 @@ async fn volume_that_is_put_over_a_noisy_line_arrives_whole() {
     stop.send_replace(true);
 }
 
-/// A client that closes its watches and drops its calls, many at a time, loses no other stream of its
-/// connection. HTTP/2 servers close connections on which too many streams are reset.
+/// A client that closes its watches and drops its calls, many at a time, loses no other stream of
+/// its connection. HTTP/2 servers close connections on which too many streams are reset.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn two_thousand_watches_closed_and_calls_dropped_64_at_a_time_end_no_other_watch() {
     let mut world = World::new().await;

@@ -57,8 +57,8 @@ const PATIENT: Duration = Duration::from_secs(120);
 const SAMPLE: Duration = Duration::from_secs(10);
 
 /// Samples of ten minutes, below which growth is not judged: caches and pools of memory fill for as
-/// long: 15 MiB of a worker within five minutes, and 3 MiB of another in the fifty-four minutes after
-/// its sixth.
+/// long: 15 MiB of a worker within five minutes, and 3 MiB of another in the fifty-four minutes
+/// after its sixth.
 const ENOUGH: usize = 60;
 
 /// Memory may grow by this part and by so much. A master keeps the frames of its last jobs, and

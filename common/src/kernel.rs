@@ -85,8 +85,8 @@ impl Profile {
         }
     }
 
-    /// Returns the derivative g'(u) at distance `u` vox, per vox^2. The tent's is that of its sides,
-    /// and 0 in its middle.
+    /// Returns the derivative g'(u) at distance `u` vox, per vox^2. The tent's is that of its
+    /// sides, and 0 in its middle.
     pub fn slope_at(&self, u: f64) -> f64 {
         if u.abs() >= self.radius || u == 0.0 {
             return 0.0;

@@ -459,8 +459,8 @@ impl Classifier {
         OpticalSample { sigma: self.rule.payload(a * factor) as f32, ..look }
     }
 
-    /// Returns the factor of opacities where the value changes by `share` of its range per vox; 1 if
-    /// the transfer function does not depend on gradients.
+    /// Returns the factor of opacities where the value changes by `share` of its range per vox; 1
+    /// if the transfer function does not depend on gradients.
     pub fn gradient_factor(&self, share: f64) -> f64 {
         match &self.gradient_points[..] {
             [] => 1.0,

@@ -243,8 +243,8 @@ pub struct ValueCore {
 impl ValueSummary {
     /// Returns the range, the histogram and the counts of `samples`; `map` turns codes into values.
     pub fn from_samples(samples: &Samples, map: ValueMap) -> Self {
-        // Counted by code first: a bin needs a division, and there are 65536 codes at most but millions of
-        // samples.
+        // Counted by code first: a bin needs a division, and there are 65536 codes at most but
+        // millions of samples.
         let v = match (samples, samples.code_counts()) {
             (_, Some(counts)) => {
                 return ValueSummary::from_code_counts(samples.kind(), &counts, map);
@@ -476,8 +476,8 @@ impl Volume {
         Ok(volume)
     }
 
-    /// Returns the codes that voxels are classified by, and that bricks hold and uploads send: places
-    /// in the palette if there is one, else the samples.
+    /// Returns the codes that voxels are classified by, and that bricks hold and uploads send:
+    /// places in the palette if there is one, else the samples.
     pub fn codes(&self) -> &Samples {
         self.places.as_ref().unwrap_or(&self.samples)
     }
@@ -560,8 +560,8 @@ impl Volume {
 pub struct VolumeHasher(Sha256);
 
 impl VolumeHasher {
-    /// Starts the digest of a volume on `lattice` whose codes have the type, the map to values and the
-    /// palette of `summary`.
+    /// Starts the digest of a volume on `lattice` whose codes have the type, the map to values and
+    /// the palette of `summary`.
     pub fn of(lattice: &Lattice, summary: &ValueSummary) -> VolumeHasher {
         let mut hasher = VolumeHasher::new(lattice, summary.map, summary.code_kind());
         if let Some(palette) = &summary.palette {
@@ -570,8 +570,8 @@ impl VolumeHasher {
         hasher
     }
 
-    /// Starts the digest of a volume without palette on `lattice`, whose codes have type `kind` and stand
-    /// for the values that `map` gives.
+    /// Starts the digest of a volume without palette on `lattice`, whose codes have type `kind` and
+    /// stand for the values that `map` gives.
     pub fn new(lattice: &Lattice, map: ValueMap, kind: SampleKind) -> VolumeHasher {
         let mut h = Sha256::new();
         h.update(b"slabcast volume 1");

@@ -74,11 +74,12 @@ pub async fn run(
     run_with(config, BrickCache::default(), master, stop).await
 }
 
-/// Serves a master like [`run`], with a cache of the caller's: one with a limit of memory, or with
-/// bricks.
+/// Serves the master at `master` (`host:port`) with the caller's brick cache, which may have a
+/// limit of memory or bricks, until `stop` turns true or the master refuses this worker. An absent
+/// master is dialled for ever.
 ///
 /// # Errors
-/// Those of [`run`].
+/// [`DialError`] if the address can't be one, or the system gives no threads.
 pub async fn run_with(
     config: Config,
     mut cache: BrickCache,

@@ -28,8 +28,8 @@ const LARGEST: u32 = 4096;
 
 /// Draws two volumes side by side under one look.
 ///
-/// --tf is fitted to A and used for both, and both are shown at one scale. Several --view's stand below
-/// each other.
+/// --tf is fitted to A and used for both, and both are shown at one scale. Several --view's stand
+/// below each other.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:

@@ -1,8 +1,8 @@
 //! Charts as SVG and as PNG, on a light and on a dark ground.
 //!
 //! Drawn by plotters: its SVG writer, and its bitmap writer, whose letters are our own
-//! ([`slabcast_session::letters`]). One drawing function serves both; [`Sheet`] hides the writer and the size
-//! of a pixel. Text is measured in the same font, so that labels never overlap.
+//! ([`slabcast_session::letters`]). One drawing function serves both; [`Sheet`] hides the writer
+//! and the size of a pixel. Text is measured in the same font, so that labels never overlap.
 
 use plotters::coord::Shift;
 use plotters::prelude::*;

@@ -33,7 +33,8 @@ pub struct InputArgs {
     #[arg(long, value_name = "ORDER", value_parser = parse::byte_order, help_heading = HEADING,
           hide_short_help = true)]
     byte_order: Option<bool>,
-    /// Distances of samples of raw numbers, pictures or NumPy arrays, such as 0.5x0.5x1.25 [default: 1x1x1]
+    /// Distances of samples of raw numbers, pictures or NumPy arrays, such as 0.5x0.5x1.25
+    /// [default: 1x1x1]
     #[arg(long, value_name = "AxBxC", value_parser = parse::spacing, help_heading = HEADING,
           hide_short_help = true)]
     spacing: Option<[f64; 3]>,
@@ -45,7 +46,8 @@ pub struct InputArgs {
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     series: Option<String>,
-    /// Which array of a file of several (.npz, .vti, .vtk): its name [default: the only one, or the first]
+    /// Which array of a file of several (.npz, .vti, .vtk): its name [default: the only one, or the
+    /// first]
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     dataset: Option<String>,

@@ -1,7 +1,8 @@
 //! A set of frame numbers.
 //!
-//! A job of 100,000 frames has an entry for each frame that was ever finished. A bit each is 12 KiB;
-//! a tree of numbers takes two megabytes, a thousand times over for the jobs that are remembered.
+//! A job of 100,000 frames has an entry for each frame that was ever finished. A bit each is 12
+//! KiB; a tree of numbers takes two megabytes, a thousand times over for the jobs that are
+//! remembered.
 
 /// See the head of the file.
 #[derive(Clone, Debug, Default)]

@@ -1,4 +1,5 @@
-//! Caps of jobs, watchers and connections by client address, and log lines of clients that reach them.
+//! Caps of jobs, watchers and connections by client address, and log lines of clients that reach
+//! them.
 //!
 //! Until jobs have owners an address is all that is known of a client. So one address may have a
 //! share of each thing that runs out, and the others find the rest free. Clients behind one address

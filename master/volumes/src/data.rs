@@ -79,8 +79,8 @@ pub(crate) struct Storage {
     pub(crate) skip_field: &'static str,
 }
 
-/// Reads the samples from a source at the start of its `len` bytes of data. `part` says which of the
-/// file's samples they are, if they are not all.
+/// Reads the samples from a source at the start of its `len` bytes of data. `part` says which of
+/// the file's samples they are, if they are not all.
 pub(crate) fn read(
     source: Source,
     len: u64,

@@ -42,8 +42,8 @@ impl ByteCap {
         self.check_within(need, stored, field, free_memory)
     }
 
-    /// Checks samples of `need` bytes against the limit that the user gave, if there is one: what is
-    /// read in parts is more than each of them.
+    /// Checks samples of `need` bytes against the limit that the user gave, if there is one: what
+    /// is read in parts is more than each of them.
     ///
     /// # Errors
     /// [`OpenErrorKind::TooLarge`], with the figures and the flag.

@@ -1,5 +1,5 @@
-//! Reader of VTK's legacy files (`.vtk`) with the data set STRUCTURED_POINTS: lines of text, between
-//! which arrays stand as text or as big-endian numbers.
+//! Reader of VTK's legacy files (`.vtk`) with the data set STRUCTURED_POINTS: lines of text,
+//! between which arrays stand as text or as big-endian numbers.
 //!
 //! One array is drawn: the one asked for, else the first with one number a point or cell. Arrays
 //! before it are skipped by their sizes; nothing after it is read.

@@ -1,9 +1,9 @@
 //! Writes volumes as NRRD and NIfTI-1.
 //!
-//! Samples are written in a type that holds their values exactly, the lattice in RAS+: the file's own
-//! numbers where the volume's codes round them ([`FileNumbers`]). NIfTI has a slope and an intercept;
-//! NRRD has none, so values that are no whole numbers become floats there. Voxels with colours of their
-//! own are written as colours.
+//! Samples are written in a type that holds their values exactly; if the volume's codes round the
+//! file's own numbers, these are written ([`FileNumbers`]). The lattice is in RAS+. NIfTI has a
+//! slope and an intercept. NRRD has neither, so values that are not whole numbers become floats
+//! there. Voxels with colours of their own are written as colours.
 
 use crate::numbers::FileNumbers;
 use crate::samples::Number;
@@ -56,7 +56,8 @@ impl Format {
 /// Samples between two calls of `on_progress`: some ms.
 const STEP_SAMPLES: usize = 1 << 16;
 
-/// Writes a volume to `out`, with the file's own `numbers` in place of the samples if there are any.
+/// Writes a volume to `out`, with the file's own `numbers` in place of the samples if there are
+/// any.
 ///
 /// `on_progress` is called after each part with the number of samples written so far.
 ///

@@ -44,8 +44,8 @@ pub(super) struct Run {
     pub(super) tell: bool,
 }
 
-/// Fields of view from which on people lose sight of where the eye is: at 60 degrees it is 0.87 times
-/// the picture's height away from the target.
+/// Fields of view from which on people lose sight of where the eye is: at 60 degrees it is 0.87
+/// times the picture's height away from the target.
 const WIDE: f64 = 60.0;
 
 /// Says where the eye is if a wide field of view takes it near to the volume or into it.

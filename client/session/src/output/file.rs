@@ -71,8 +71,9 @@ pub fn write_atomic(
     whole(path, fill).map_err(|e| Fail::io(path, "writing", &e))
 }
 
-/// Time between two attempts on a disk that takes nothing. A person who deletes something looks at the progress
-/// within a second or two; at a tenth of this, nothing is gained and logs of the file system fill.
+/// Time between two attempts on a disk that takes nothing. A person who deletes something looks at
+/// the progress within a second or two; at a tenth of this, nothing is gained and logs of the file
+/// system fill.
 const TRY_AGAIN: Duration = Duration::from_secs(1);
 
 /// Waits for a disk that takes nothing: full, or its folder gone or read-only. Warns once and tries
@@ -80,7 +81,8 @@ const TRY_AGAIN: Duration = Duration::from_secs(1);
 #[derive(Debug, Default)]
 pub struct DiskWait {
     given_up: AtomicBool,
-    /// Text of the note that ends the wait, such as "the folder is back"; `None` while no thread waits.
+    /// Text of the note that ends the wait, such as "the folder is back"; `None` while no thread
+    /// waits.
     waiting: Mutex<Option<&'static str>>,
 }
 

@@ -328,7 +328,8 @@ impl RunProvenance {
         p
     }
 
-    /// Returns the provenance of all frames in one file, with level and sums as the master decided them.
+    /// Returns the provenance of all frames in one file, with level and sums as the master decided
+    /// them.
     pub fn movie(&self, stats: &FrameStats) -> Provenance {
         self.whole(stats)
     }

@@ -369,8 +369,8 @@ impl ViewPath {
         self.keyframes.as_ref().is_some_and(|k| k.keys.iter().any(|key| key.view.is_some()))
     }
 
-    /// Returns the name of the side of the body that a frame is seen from, by its number on the whole
-    /// path; `None` for frames between keys and from elsewhere.
+    /// Returns the name of the side of the body that a frame is seen from, by its number on the
+    /// whole path; `None` for frames between keys and from elsewhere.
     pub fn side_name(&self, number: usize) -> Option<&'static str> {
         let side = self.keyframes.as_ref()?.key_at(number)?.view?;
         Side::NAMES.iter().find(|(_, s)| *s == side).map(|(name, _)| *name)
@@ -458,8 +458,8 @@ impl Cameras<'_> {
     }
 }
 
-/// Lattice, orientation and curve from which the camera of each frame of a path is made. Its size grows
-/// with the number of keys or points, not with the number of frames.
+/// Lattice, orientation and curve from which the camera of each frame of a path is made. Its size
+/// grows with the number of keys or points, not with the number of frames.
 pub struct Prepared {
     lattice: Lattice,
     orientation: Orientation,

@@ -17,9 +17,9 @@
 //!    the histogram falls all the way. Little foreground is *sparse*: vessels, a wire, a shell; much
 //!    of it is a *cloud*, which an opaque surface would hide.
 //!
-//! All numbers are shares of the range that presets are fitted to
-//! ([`ValueSummary::core_range`]): 0 its lower end, 1 its upper one. Mostly that is the whole range;
-//! it leaves out what one hot voxel or the padding around a scan would add to it.
+//! All numbers are shares of the range that presets are fitted to ([`ValueSummary::core_range`]): 0
+//! its lower end, 1 its upper one. Mostly that is the whole range; it leaves out what one hot voxel
+//! or the padding around a scan would add to it.
 
 use slabcast_common::volume::{SampleKind, ValueSummary};
 use std::ops::Range;
@@ -36,7 +36,8 @@ const DEPTH: f64 = 1.5;
 const FLOOR: f64 = 1.25;
 
 /// Width of a gap, as a share of the range, behind which something whole begins: a label of a
-/// segmentation, an object in an air that was set to zero. Tails of scans have gaps of a bin or two.
+/// segmentation, an object in an air that was set to zero. Tails of scans have gaps of a bin or
+/// two.
 const GAP: f64 = 0.1;
 
 /// Share of the volume above which foreground without a valley is a cloud.

@@ -455,9 +455,9 @@ impl RegionFrame {
     }
 }
 
-/// Whether a worker may try a task that workers failed at or that is audited: the likeliest do. These
-/// are workers that have not failed at it, and of them those that have drawn something before, since
-/// anybody may call himself a new worker.
+/// Whether a worker may try a task that workers failed at or that is audited: the likeliest do.
+/// These are workers that have not failed at it, and of them those that have drawn something
+/// before, since anybody may call himself a new worker.
 pub(super) fn may_try(cluster: &Cluster, task: &Task, id: WorkerId) -> bool {
     let rank = |w: &Worker| match task.was_failed_by(&w.identity) {
         true => 0,

@@ -32,8 +32,8 @@ pub fn open_source(
 /// Bytes of samples from which a Zarr picture is read by blocks rather than as a whole.
 const LARGE_BYTES: u64 = 256 << 20;
 
-/// Returns whether a volume is better read by blocks ([`open_source`]) than as a whole: a Zarr picture
-/// with a finest level of more than 256 MiB, or a formula for tests of size.
+/// Returns whether a volume is better read by blocks ([`open_source`]) than as a whole: a Zarr
+/// picture with a finest level of more than 256 MiB, or a formula for tests of size.
 pub fn is_large(path: &Path, hints: &Hints) -> bool {
     if path.to_string_lossy().starts_with(FormulaSource::PREFIX) {
         return true;

@@ -475,8 +475,8 @@ fn leading_number(text: &str) -> Option<f64> {
     longest.filter(|x| x.is_finite())
 }
 
-/// Sorts the slices, checks that they agree, and returns the preface with their lattice, and how many
-/// slices are missing after each; nothing if none is.
+/// Sorts the slices, checks that they agree, and returns the preface with their lattice, and how
+/// many slices are missing after each; nothing if none is.
 fn arrange(
     series: &mut Series,
     pick: &Pick,

@@ -31,9 +31,9 @@ use slabcast_scene::brick_needs::BrickNeeds;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// The bricks of a volume that hold a relevant voxel. Each is kept once, encoded or decoded. A voxel
-/// is relevant if the transfer function shows its value and it lies inside the cropping box, or near
-/// such a voxel ([`BrickNeeds::halo`]).
+/// The bricks of a volume that hold a relevant voxel. Each is kept once, encoded or decoded. A
+/// voxel is relevant if the transfer function shows its value and it lies inside the cropping box,
+/// or near such a voxel ([`BrickNeeds::halo`]).
 pub struct BrickStore {
     key: BrickSetKey,
     needs: BrickNeeds,

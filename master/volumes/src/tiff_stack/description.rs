@@ -66,8 +66,8 @@ impl Description {
         }
     }
 
-    /// Returns which pages are slices: those of the picked channel and time, by default the first.
-    /// Notes what was not asked for.
+    /// Returns the pages of the picked channel and time, by default the first, which are the
+    /// slices. Notes the choices without a flag.
     pub(super) fn slices(&mut self, pick: &Pick) -> Result<Option<Slices>, Problem> {
         if self.axes.is_empty() {
             pick.choose(&[], "ImageDescription")?;

@@ -1,9 +1,10 @@
 //! Reader of VTK's XML image data (`.vti`): ascii, base64 and appended, plain or in blocks of zlib,
 //! lz4 or xz.
 //!
-//! With raw appended data the file is no valid XML, so it is read as a stream of tags. One array is
-//! drawn: the one asked for, else the active scalars of the points, else the first array with one number
-//! a point, else with one a cell. Points and cells that VTK's masks hide (`vtkGhostType`, `vtkValidPointMask`) become NaN.
+//! With raw appended data the file is not valid XML, so it is read as a stream of tags. One array
+//! is drawn: the one asked for, else the active scalars of the points, else the first array with
+//! one number a point, else the first with one number a cell. Points and cells that VTK's masks
+//! hide (`vtkGhostType`, `vtkValidPointMask`) become NaN.
 //!
 //! Binary data begin with a header of 32- or 64-bit numbers (`header_type`). Plain data have the
 //! number of bytes; compressed data have the number of blocks, the size of a whole one, the size of

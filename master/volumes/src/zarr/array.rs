@@ -452,7 +452,8 @@ impl Array {
         (self.inner().iter().product::<u64>() * self.stored_size()) as usize
     }
 
-    /// Decodes the chunks of a shard that lie in `layer` into `out`. A shard's chunks may be shards.
+    /// Decodes the chunks of a shard that lie in `layer` into `out`. A shard's chunks may be
+    /// shards.
     fn read_shard<T: Copy, const N: usize>(
         &self,
         placed: &Placed,
@@ -510,8 +511,8 @@ impl Array {
         Ok(())
     }
 
-    /// Puts the fill value in place of a chunk of `shape`, whose first sample has index `first` in the
-    /// array, where it lies in `layer`.
+    /// Puts the fill value in place of a chunk of `shape`, whose first sample has index `first` in
+    /// the array, where it lies in `layer`.
     fn fill<T: Copy, const N: usize>(
         &self,
         placed: &Placed,

@@ -428,8 +428,8 @@ impl Shard {
         Ok(Shard { inner, nested, at_end, checked })
     }
 
-    /// Reads the index of a shard of `len` bytes from `at` on: offset from there and size, in bytes, of
-    /// each inner chunk.
+    /// Reads the index of a shard of `len` bytes from `at` on: offset from there and size, in
+    /// bytes, of each inner chunk.
     pub(super) fn index(
         &self,
         file: &mut File,

@@ -101,7 +101,8 @@ pub(super) fn render<S: FieldSum>(
     state.to_picture()
 }
 
-/// Adds the segment between two planes of the pixel at column `x` and row `y` to pixel `i` of `out`.
+/// Adds the segment between two planes of the pixel at column `x` and row `y` to pixel `i` of
+/// `out`.
 pub(super) fn close<S: FieldSum>(
     frame: &Frame,
     (rule, scene): (&FieldRule, &FieldScene),

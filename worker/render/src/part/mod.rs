@@ -189,9 +189,9 @@ impl Part<'_> {
         }
     }
 
-    /// Counts sheet `k` at the pixels of a row that was closed, given by their places in the part, as
-    /// one that was read where it held something. A bit each: those that were open, and those that are
-    /// shut now.
+    /// Counts sheet `k` at the pixels of a row that was closed, given by their places in the part,
+    /// as one that was read where it held something. A bit each: those that were open, and those
+    /// that are shut now.
     #[cold]
     pub(crate) fn count_sheet(
         &self,

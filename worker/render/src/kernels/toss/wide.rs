@@ -15,7 +15,8 @@ use slabcast_common::shade::NO_NORMAL;
 use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
 use slabcast_common::volume::Samples;
 
-/// Compiles [`Sieve::sift`] for an instruction set. All functions that it calls are inlined into it.
+/// Compiles [`Sieve::sift`] for an instruction set. All functions that it calls are inlined into
+/// it.
 macro_rules! compiled {
     ($name:ident, $features:literal, $lanes:ty) => {
         #[target_feature(enable = $features)]

@@ -21,8 +21,8 @@ pub(super) struct Blocks {
 }
 
 impl Blocks {
-    /// Blocks of `codes`, the voxels of a lattice of `dims` (NaN where there is none), whose kernels
-    /// reach as far as `reach` along the axes of the lattice.
+    /// Blocks of `codes`, the voxels of a lattice of `dims` (NaN where there is none), whose
+    /// kernels reach as far as `reach` along the axes of the lattice.
     pub(super) fn new(
         dims: [u32; 3],
         codes: &[f32],

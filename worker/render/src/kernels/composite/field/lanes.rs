@@ -289,8 +289,8 @@ unsafe fn smooth<L: Floats>(
     }
 }
 
-/// Returns a bit for each lane whose plane at depth `z` (vox) is near a face of the volume or outside
-/// the cropping box.
+/// Returns a bit for each lane whose plane at depth `z` (vox) is near a face of the volume or
+/// outside the cropping box.
 #[inline(always)]
 unsafe fn near<L: Floats>(rule: &FieldRule, rays: &Rays<L::Floats>, z: f32) -> u32 {
     // SAFETY: the caller has these instructions.

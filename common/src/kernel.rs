@@ -353,10 +353,10 @@ pub fn ellipsoid(steps: &DMat3) -> (DVec3, Lean) {
     (DVec3::new(txx, tyy, tzz), lean)
 }
 
-/// Returns [`ellipsoid`] as it is drawn in sheets of `thickness` vox by a kernel of deviation `std`
-/// and `radius` steps.
+/// Returns spread and lean of the kernel's ellipsoid ([`ellipsoid`]) as they are drawn in sheets of
+/// `thickness` vox by a kernel of deviation `std` and `radius` steps.
 ///
-/// Where a kernel leans, the depth of a section smears it across. It is drawn in one place instead,
+/// The depth of a section of a leaning kernel smears it across. It is drawn in one place instead,
 /// and widened so that all sections together are as wide as the kernel. Against the integral of the
 /// kernel between the sheet's planes, a scene of balls 2.2 times as wide along one axis is then off
 /// by 0.026 of 1/255 at sheets of a vox. It would be off by 0.23 with sections half-way to the

@@ -45,10 +45,10 @@ impl ValueBins {
         })
     }
 
-    /// Returns a support grown to whole bins: the same for all supports with ends in the same bins.
-    /// What lies beyond the bins stays out unless `support` reaches there. An end stays as it is
-    /// where growing would add more than `ADDED_DIVISOR` allows of the samples that `summary`
-    /// counts: air, above all.
+    /// Returns a support grown to whole bins, so that all supports with ends in the same bins give
+    /// one result. Codes beyond the bins are added only if `support` reaches there. An end is not
+    /// grown if that would add too many of the samples that `summary` counts (`ADDED_DIVISOR`):
+    /// air, above all.
     #[must_use]
     pub fn rounded(&self, support: &Support, summary: &ValueSummary) -> Support {
         let edge = |bin: u32| self.first_code + self.width * f64::from(bin);

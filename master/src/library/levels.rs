@@ -168,7 +168,8 @@ impl Entries {
         held.map(|level| sample_bytes(&level.served.info)).sum()
     }
 
-    /// When the level that was unused for longest was used; `None` if none is in memory.
+    /// Returns the least recently used level, with the time of its last use; `None` if no level is
+    /// in memory.
     pub(super) fn oldest_level(&self) -> Option<(u64, Digest32)> {
         let held = self.levels.iter().filter(|(_, level)| level.source.is_some());
         held.map(|(digest, level)| (level.used, *digest)).min()

@@ -645,7 +645,7 @@ impl Entries {
         self.by_name.values().find(|e| e.digest() == Some(digest))?.served.clone()
     }
 
-    /// Name of the volume that is meant where none is named.
+    /// Returns the name of the volume for requests that name none.
     fn default_name(&self) -> Result<String, VolumeError> {
         let mut given = self.by_name.iter().filter(|(_, e)| e.origin == VolumeOrigin::Given);
         if let Some((name, _)) = given.next() {

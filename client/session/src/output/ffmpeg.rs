@@ -88,7 +88,7 @@ fn coding(format: Format, behind: [u8; 3]) -> Vec<String> {
     words.iter().map(|&word| word.into()).collect()
 }
 
-/// A background as sRGB bytes; black where there is none.
+/// Converts a background to sRGB bytes; without a background to black.
 pub(super) fn bytes_of(background: Background) -> [u8; 3] {
     match background {
         Background::Transparent => [0; 3],

@@ -637,7 +637,7 @@ pub fn write_picture(
     write(path, frame, &Inside { provenance: "", dpi }, format, &DiskWait::default())
 }
 
-/// Returns a background as sRGB bytes; black where there is none.
+/// Converts a background to sRGB bytes; without a background to black.
 pub fn background_bytes(background: Background) -> [u8; 3] {
     ffmpeg::bytes_of(background)
 }

@@ -119,7 +119,8 @@ impl Provenance {
         }
     }
 
-    /// Returns the provenance as JSON for a picture's file, or for that of a moving picture.
+    /// Returns the provenance as JSON for the file of a picture, still or moving. `frame` gives its
+    /// hash.
     pub(super) fn written(mut self, frame: &Frame) -> String {
         // Only for a single frame without a hash of its linear pixels.
         if self.view_sha256.is_some() && self.pixels_sha256.is_none() {

@@ -179,7 +179,7 @@ fn coding_to_json(coding: &Coding) -> Value {
         Form::Same => json!({"form": "same"}),
         Form::Flipped => json!({"form": "flipped"}),
         Form::Floats { limit } => json!({"form": "floats", "limit": limit}),
-        // As texts: the range of i64 and u64 together has 65 bits, JSON's integers have 64.
+        // Written as texts: the range of i64 and u64 together has 65 bits, JSON's integers have 64.
         Form::Integers { min, max } => {
             json!({"form": "integers", "min": min.to_string(), "max": max.to_string()})
         }

@@ -121,7 +121,7 @@ fn refused(what: impl Into<String>) -> Problem {
     )
 }
 
-/// ImageJ writes lines of `key=value`; channels go fastest, times slowest.
+/// Parses ImageJ's description: lines of `key=value`. Channels go fastest, times slowest.
 fn imagej(text: &str) -> Result<Description, Problem> {
     let get = |key: &str| {
         text.lines().find_map(|l| l.strip_prefix(key)?.strip_prefix('=').map(str::trim))
@@ -240,7 +240,8 @@ fn ome(text: &str, pixels: &str) -> Result<Description, Problem> {
     Ok(description)
 }
 
-/// tifffile writes `{"shape": [2, 6, 10, 12], "axes": "CZYX"}`, the slowest axis first.
+/// Parses tifffile's description: `{"shape": [2, 6, 10, 12], "axes": "CZYX"}`, the slowest axis
+/// first.
 fn shaped(text: &str, page: &Page) -> Result<Description, Problem> {
     let (width, height) = (u64::from(page.width), u64::from(page.height));
     let after = |key: &str| {

@@ -24,7 +24,8 @@ fn orientation() -> Orientation {
     Orientation::new(None, None).expect("the defaults")
 }
 
-/// A master of one source and a worker of this process, with at most `brick_bytes` of bricks each.
+/// Starts a master of one source and a worker in this process, with at most `brick_bytes` of bricks
+/// each.
 fn start(source: Arc<dyn BlockSource>, brick_bytes: u64, stop: &watch::Receiver<bool>) -> Master {
     let mut config = MasterConfig::of(Library::of_source(source, orientation()));
     config.shares = Shares { bricks: brick_bytes, ..Shares::default() };
@@ -46,7 +47,7 @@ fn start(source: Arc<dyn BlockSource>, brick_bytes: u64, stop: &watch::Receiver<
     master
 }
 
-/// A turn around a volume, or around its centre with so much of it in view.
+/// Returns the request of a turn around a volume; `height` is the part of it in view.
 fn request(key: &str, height: Option<f64>, level: LevelChoice) -> PathRequest {
     let turn = Turntable { frames: 4, step: 35.0, elevation: 20.0, height, ..Turntable::default() };
     PathRequest {
@@ -82,7 +83,8 @@ async fn draw(handle: &Handle, request: PathRequest) -> Result<Vec<String>, Stri
     }
 }
 
-/// Sparse cells of 64 samples, each of one value with detail.
+/// Returns the formula volume `cells`: sparse cells of 64 samples an edge, each of one value with
+/// detail.
 fn cells(size: &str) -> Arc<dyn BlockSource> {
     let text = format!("{}{size}", FormulaSource::PREFIX);
     Arc::new(FormulaSource::open(&text).expect("a size"))

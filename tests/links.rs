@@ -136,7 +136,7 @@ async fn embedded_workers_give_the_serial_bytes_and_true_statistics() {
     let master = master();
     let handle = master.handle();
     let _stops = [embed(&handle, config("a", 1)), embed(&handle, config("b", 2))];
-    // Where the data say that two slabs hide as much as three there are two.
+    // Equal borders give three slabs; borders by data may find that two hide as much.
     let (schedule, borders) = (Schedule::Slab, Borders::Equal);
     let slab = Work { schedule, borders, ..Work::default() };
     let ask = request("1", ProjectionKind::Persp, slab);

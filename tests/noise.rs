@@ -1,5 +1,5 @@
-//! Links on which bits flip, links that swallow bricks, and a worker that says too much: pixels stay
-//! true, nothing hangs, and nobody else waits.
+//! Links on which bits flip, links that swallow bricks, and a worker that says too much: pixels
+//! stay true, nothing hangs, and nobody else waits.
 //!
 //! A proxy stands between a master and its worker, and between the master and a client. The
 //! campaign of a hundred thousand flips in each direction runs at night (`tests/nightly.sh flips`).
@@ -253,7 +253,7 @@ async fn watched(seed: u64, flips: u64, one_in: u64) {
     world.dial("quiet", &world.address);
     let begin = Instant::now();
     let mut damaged = 0;
-    // What the client waits for, for the message of a hang.
+    // The call that the client waits for, to be named if it hangs.
     let doing = RefCell::new(String::new());
     let did = |what: String| *doing.borrow_mut() = format!("{what} at {:.1?}", begin.elapsed());
     while noise.iter().any(|n| n.left.load(Relaxed) > 0) {
@@ -395,8 +395,8 @@ async fn volume_that_is_put_over_a_noisy_line_arrives_whole() {
     stop.send_replace(true);
 }
 
-/// A client that closes its watches and drops its calls, many at a time, loses no other stream of its
-/// connection. HTTP/2 servers close connections on which too many streams are reset.
+/// A client that closes its watches and drops its calls, many at a time, loses no other stream of
+/// its connection. HTTP/2 servers close connections on which too many streams are reset.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn two_thousand_watches_closed_and_calls_dropped_64_at_a_time_end_no_other_watch() {
     let mut world = World::new().await;
@@ -407,7 +407,7 @@ async fn two_thousand_watches_closed_and_calls_dropped_64_at_a_time_end_no_other
     assert!(matches!(other.next().await, Ok(Some(Update::Notice(_)))));
     let mut dropped = 0;
     for _ in 0..32 {
-        // Of 64 calls a connection has 31 at a time beside the first watch.
+        // A connection takes 31 calls at a time beside the first watch; 64 are made.
         let closing = (0..64).map(|_| {
             let (client, job) = (client.clone(), job.clone());
             tokio::spawn(async move {

@@ -194,7 +194,7 @@ fn modules_of_the_client_crates_have_no_circular_imports() {
                 }
             }
         }
-        // What a module reaches, by as many rounds as there are modules at most.
+        // Modules that each module reaches, found in at most as many rounds as there are modules.
         let mut reach = sees.clone();
         loop {
             let before = reach.clone();

@@ -57,8 +57,8 @@ const PATIENT: Duration = Duration::from_secs(120);
 const SAMPLE: Duration = Duration::from_secs(10);
 
 /// Samples of ten minutes, below which growth is not judged: caches and pools of memory fill for as
-/// long: 15 MiB of a worker within five minutes, and 3 MiB of another in the fifty-four minutes after
-/// its sixth.
+/// long: 15 MiB of a worker within five minutes, and 3 MiB of another in the fifty-four minutes
+/// after its sixth.
 const ENOUGH: usize = 60;
 
 /// Memory may grow by this part and by so much. A master keeps the frames of its last jobs, and
@@ -265,7 +265,7 @@ fn keep_worker(world: &World, number: u64) -> Process {
                     worker.signal("-KILL");
                     break;
                 }
-                // What it held when it was stopped it holds when it is killed.
+                // A stopped worker still holds its leases when it is killed.
                 7 => {
                     world.count("kills");
                     worker.signal("-STOP");
@@ -382,7 +382,7 @@ async fn run_job<'a>(
             Ok(())
         }
         20..25 => {
-            // The same request again is the same job, and has any number of watchers.
+            // A repeated request is the first one's job, which may have any number of watchers.
             let again = client.submit(&request).await?;
             if again != job.id {
                 world.fail("error: second job", &format!("{} and {again}", job.id));

@@ -1,5 +1,5 @@
-//! Several volumes on one master, with real processes: by name, by file, put and removed, and what a
-//! restart keeps.
+//! Several volumes on one master, with real processes: by name, by file, put and removed, and what
+//! a restart keeps.
 
 #[path = "support/processes.rs"]
 mod processes;
@@ -40,7 +40,7 @@ fn picture(dir: &Path, volume: &str, more: &[&str], to: &str) -> Vec<u8> {
     std::fs::read(dir.join(to)).expect("the picture")
 }
 
-/// A folder with two volumes of a master, and one that is a client's alone.
+/// Makes a folder with two volumes for a master, and one that only the client has.
 fn files() -> tempfile::TempDir {
     let dir = tempfile::tempdir().expect("a folder");
     std::fs::create_dir(dir.path().join("scans")).expect("a folder");

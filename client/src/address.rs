@@ -5,8 +5,8 @@ use crate::ClientError;
 /// Port of a master where an address names none.
 pub const DEFAULT_PORT: u16 = 7433;
 
-/// Returns an address with [`DEFAULT_PORT`] where it is a host alone. A number alone is no host, since
-/// it is meant as a port.
+/// Adds [`DEFAULT_PORT`] to an address that is only a host. A number alone stays as it is, since it
+/// is meant as a port.
 pub fn with_default_port(address: &str) -> String {
     let is_number = address.bytes().all(|c| c.is_ascii_digit());
     let is_host_alone = address.ends_with(']') || !(address.contains(':') || is_number);

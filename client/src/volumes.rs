@@ -11,8 +11,8 @@ use slabcast_scene::request::VolumeChoice;
 use std::time::Duration;
 use tokio::time::Instant;
 
-/// Samples of a chunk: with four bytes each it has 1 MiB. Larger ones gain nothing on a LAN, and more
-/// is sent again when one is damaged.
+/// Samples of a chunk: with four bytes each it has 1 MiB. Larger ones gain nothing on a LAN, and
+/// more is sent again when one is damaged.
 const CHUNK_SAMPLES: usize = 1 << 18;
 
 /// First wait before a master that is away is called again; it doubles up to [`LONGEST_WAIT`].
@@ -64,15 +64,16 @@ impl Client {
         }
     }
 
-    /// Puts a volume on the master, or finds that it has it. `told` is called with the bytes of samples
-    /// that the master has, as they grow. Goes on where it was when the connection breaks, for up to
-    /// two minutes of a master that is away. `samples` are the volume's codes ([`Volume::codes`]).
+    /// Uploads a volume to the master, unless the master has it. `samples` are the volume's codes
+    /// ([`Volume::codes`]). `told` is called with the bytes of samples that the master has, as they
+    /// grow. A broken connection is made again and the upload goes on, unless the master is away
+    /// for two minutes.
     ///
     /// [`Volume::codes`]: slabcast_common::volume::Volume::codes
     ///
     /// # Errors
-    /// [`ClientError::Volume`] if the master refuses it, with its figures; [`ClientError::UploadStopped`]
-    /// if it stays away.
+    /// [`ClientError::Volume`] if the master refuses it, with its figures;
+    /// [`ClientError::UploadStopped`] if it stays away.
     ///
     /// # Panics
     /// If `samples` are not as many as `header` says.

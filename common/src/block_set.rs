@@ -1,7 +1,8 @@
 //! Sets of blocks of a volume: cubes of [`BLOCK_EDGE`] samples.
 //!
-//! What a picture needs of a volume that does not fit into memory is decided block by block: a block
-//! outside of the picture, or whose values nothing shows, is neither read nor cut into bricks.
+//! The master decides block by block which part of a large volume a picture needs. A block outside
+//! the picture, or whose values the transfer function does not show, is neither read nor cut into
+//! bricks.
 
 use crate::brick::TightBox;
 use crate::view::View;
@@ -9,7 +10,7 @@ use crate::view::View;
 /// Edge of a block in samples: eight bricks.
 pub const BLOCK_EDGE: u32 = 64;
 
-/// Blocks along each axis of a group that is looked at before its blocks are.
+/// Blocks along each axis of a group. A group that misses the picture is skipped as a whole.
 const GROUP: u32 = 8;
 
 /// Returns the number of blocks along each axis of a volume of `dims` samples.
@@ -52,12 +53,13 @@ impl BlockSet {
         self.bits.iter().all(|&word| word == 0)
     }
 
-    /// Returns a bit for each block, in words of 64: equal of equal sets of one volume.
+    /// Returns a bit for each block, in words of 64. Two sets of one volume are equal if their
+    /// words are.
     pub fn words(&self) -> &[u64] {
         &self.bits
     }
 
-    /// Adds the blocks of which a voxel may touch the picture of `view`.
+    /// Adds the blocks with a voxel that may touch the picture of `view`.
     pub fn add_visible(&mut self, view: &View) {
         let dims = block_dims(self.dims);
         let box_of = |lo: [u32; 3], edge: u32| TightBox {
@@ -117,7 +119,7 @@ mod tests {
                 let is_visible = view.project(&TightBox { lo, hi }).is_some();
                 assert_eq!(set.contains(block), is_visible, "block {block} at height {height}");
             }
-            // Of the whole volume a few blocks touch no pixel's centre.
+            // Even in a view of the whole volume, a few blocks touch no pixel's centre.
             let is_most = 10 * set.len() > 9 * count;
             assert!(!set.is_empty() && (height > 1000.0) == is_most, "{}", set.len());
             let before = set.clone();

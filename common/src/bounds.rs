@@ -102,8 +102,8 @@ pub fn accumulation(view: &View, within: &TightBox) -> f64 {
     255.0 * 2.0 * sheets / f64::from(1u32 << 25)
 }
 
-/// How far a picture is at most from one whose kernels differ from the drawn ones, by a bound that
-/// holds on every pixel, in 1/255. See [`rounding`] and [`truncation`].
+/// Bound on the difference, in 1/255 and on every pixel, between a picture and one with other
+/// kernels than the drawn ones. See [`rounding`] and [`truncation`].
 ///
 /// Let a change of the field take sigma to sigma' and sigma C to sigma' C' along a ray, T be what
 /// is let through before it and R' the light that comes from behind after it. Then the pixel
@@ -198,7 +198,7 @@ impl Change<'_> {
                     _ => near,
                 }
             });
-            // Of cubic voxels two axes are alike, or all, and are looked at once.
+            // Axes that are alike (two or three in cubic voxels) are computed once.
             let first = [0, 1, 2].map(|a: usize| {
                 let of = |a: usize| (self.drawn[a], self.beyond[a], cells[a]);
                 (0..a).find(|&b| of(a) == of(b)).unwrap_or(a)

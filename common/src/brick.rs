@@ -15,7 +15,7 @@ pub const BRICK_VOXELS: usize = 512;
 /// Largest number of bricks that a volume may have: a 4096^3 volume has 2^27.
 pub const MAX_BRICKS: u64 = 1 << 27;
 
-/// How a volume is cut into bricks.
+/// Division of a volume into bricks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BrickGrid {
     /// Number of bricks along each index axis (i, j, k).

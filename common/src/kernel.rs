@@ -85,8 +85,8 @@ impl Profile {
         }
     }
 
-    /// Returns the derivative g'(u) at distance `u` vox, per vox^2. The tent's is that of its sides,
-    /// and 0 in its middle.
+    /// Returns the derivative g'(u) at distance `u` vox, per vox^2. The tent's is that of its
+    /// sides, and 0 in its middle.
     pub fn slope_at(&self, u: f64) -> f64 {
         if u.abs() >= self.radius || u == 0.0 {
             return 0.0;
@@ -110,7 +110,7 @@ impl Profile {
     /// 1 for frequency 0. `frequency` in cycles per vox.
     pub fn transform_at(&self, frequency: f64) -> f64 {
         let splines = match self.kernel {
-            // Of a B-spline: a power of sinc.
+            // The transform of a B-spline is a power of sinc.
             Kernel::Bspline | Kernel::Interpolating => Some((4, 0.5 * self.radius)),
             Kernel::Tent => Some((2, self.radius)),
             Kernel::Gaussian => None,
@@ -136,7 +136,7 @@ impl Profile {
     /// Returns the integral of g from -radius to `u` vox: 0 to 1.
     pub fn integral_to(&self, u: f64) -> f64 {
         let u = u.clamp(-self.radius, self.radius);
-        // What lies between the middle and `t` steps of a spline.
+        // Integral of a spline from its middle to `t` steps.
         let half = |t: f64| match self.kernel {
             Kernel::Tent => t * (1.0 - 0.5 * t),
             _ if t < 1.0 => t * (2.0 / 3.0 + t * t * (0.125 * t - 1.0 / 3.0)),
@@ -253,8 +253,7 @@ impl Front {
     /// Returns the centroid between this plane and one behind it.
     fn to(&self, back: &Front) -> f64 {
         let weight = back.weight - self.weight;
-        // Of less than this there is nothing to be seen, and cancellation is all that there is of
-        // its moment.
+        // Less weight than this is invisible, and its moment is only cancellation.
         if weight < 1e-9 {
             return 0.5 * (self.at + back.at);
         }
@@ -265,9 +264,9 @@ impl Front {
 /// Shear of a kernel against the eye's axes. The head of this file has the formulas.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Lean {
-    /// How far the kernel's middle moves along x and y for each vox of depth.
+    /// Distance that the kernel's middle moves along x and y for each vox of depth.
     pub depth: [f64; 2],
-    /// How far the middle of a row moves along x for each vox of y.
+    /// Distance that the middle of a row moves along x for each vox of y.
     pub row: f64,
 }
 
@@ -354,10 +353,10 @@ pub fn ellipsoid(steps: &DMat3) -> (DVec3, Lean) {
     (DVec3::new(txx, tyy, tzz), lean)
 }
 
-/// Returns [`ellipsoid`] as it is drawn in sheets of `thickness` vox by a kernel of deviation `std`
-/// and `radius` steps.
+/// Returns spread and lean of the kernel's ellipsoid ([`ellipsoid`]) as they are drawn in sheets of
+/// `thickness` vox by a kernel of deviation `std` and `radius` steps.
 ///
-/// Where a kernel leans, the depth of a section smears it across. It is drawn in one place instead,
+/// The depth of a section of a leaning kernel smears it across. It is drawn in one place instead,
 /// and widened so that all sections together are as wide as the kernel. Against the integral of the
 /// kernel between the sheet's planes, a scene of balls 2.2 times as wide along one axis is then off
 /// by 0.026 of 1/255 at sheets of a vox. It would be off by 0.23 with sections half-way to the

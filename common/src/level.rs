@@ -11,15 +11,14 @@ use serde::{Deserialize, Serialize};
 /// of at most 2^32 samples at least.
 pub const MAX_LEVEL: u32 = 63;
 
-/// Most pixels that a vox may cover at the level that [`LevelChoice::Auto`] draws. Chosen by measured
-/// error and time (docs/measurements/performance.md, Levels of detail).
+/// Most pixels that a vox may cover at the level that [`LevelChoice::Auto`] draws. Chosen by
+/// measured error and time (docs/measurements/performance.md, Levels of detail).
 pub const AUTO_PIXELS: f64 = 1.0;
 
 /// Level of detail that a client asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LevelChoice {
-    /// Level of this number, 0 for all detail. Of a volume with fewer levels, or of which finer ones
-    /// are not there, the nearest.
+    /// Level of this number, 0 for all detail. If the volume does not have it, the nearest level.
     At(u32),
     /// Coarsest level at which a vox covers at most [`AUTO_PIXELS`] in every view of the job.
     Auto,
@@ -61,8 +60,8 @@ impl std::str::FromStr for LevelChoice {
 pub struct LevelStats {
     /// Number of the level; 0 is all detail.
     pub level: u32,
-    /// Pixels that a vox of the level covers where the view shows it largest; `null` where the eye is
-    /// inside the volume.
+    /// Pixels that a vox of the level covers where the view shows it largest; `null` where the eye
+    /// is inside the volume.
     pub pixels_per_vox: Option<f64>,
     /// Number of samples of the level.
     pub samples: u64,

@@ -1,4 +1,4 @@
-//! How far ahead a stalled region asks for bricks.
+//! Distance, in sheets, that a stalled region looks ahead when it asks for bricks.
 //!
 //! A region that reaches a sheet for which it lacks bricks asks for those and, in the same message,
 //! for bricks of the next sheets that nothing hides yet. Looking far fetches bricks that nearer

@@ -169,7 +169,7 @@ pub enum ToWorker {
     Directory {
         /// The set.
         set: BrickSetKey,
-        /// How the set's volume is cut into bricks.
+        /// Division of the set's volume into bricks.
         grid: BrickGrid,
         /// Bricks of the directory in earlier parts.
         first: u32,
@@ -289,7 +289,7 @@ pub struct TaskTimes {
 pub struct RegionCost {
     /// Bricks that the region was drawn from, as places in the directory, ascending.
     pub touched: Vec<u32>,
-    /// How often the region stalled for lack of bricks.
+    /// Number of times that the region stalled for lack of bricks.
     pub stalls: u32,
     /// Total time in microseconds that the region was stalled. Its thread may have drawn other
     /// regions meanwhile.

@@ -14,9 +14,9 @@ pub enum Kernel {
     /// Cubic B-spline: a constant field stays constant along the lattice's axes, and within 1 %
     /// from any side.
     Bspline,
-    /// Cubic B-spline of coefficients instead of values: a field that passes through the samples, seen
-    /// along the lattice's axes, and nearly so from any side (Unser, "Splines: a perfect fit", 1999). The
-    /// sharpest; it overshoots beside edges. With [`Classify::After`] alone.
+    /// Cubic B-spline of coefficients instead of values: a field that passes through the samples,
+    /// seen along the lattice's axes, and nearly so from any side (Unser, "Splines: a perfect fit",
+    /// 1999). The sharpest; it overshoots beside edges. With [`Classify::After`] alone.
     Interpolating,
     /// Tent, the linear B-spline. Sharpest, and of a constant field from a slanted side up to 39 %
     /// ripple (docs/design/numerics.md section 4).
@@ -35,7 +35,7 @@ pub enum Classify {
     Before,
 }
 
-/// How the sheets of a pixel are composited.
+/// Rule by which the sheets of a pixel are composited.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Compositing {
@@ -216,7 +216,8 @@ impl Quality {
     }
 
     /// Returns whether 16-bit sums have room for a sheet's ripple. They have none for a tent,
-    /// coefficients that overshoot, a narrow or wide Gaussian, or the paper's opacities, which add up to more than one.
+    /// coefficients that overshoot, a narrow or wide Gaussian, or the paper's opacities, which add
+    /// up to more than one.
     pub fn fits_i16(&self) -> bool {
         let even = self.kernel != Kernel::Gaussian || (self.std >= 0.5 && self.radius <= 2.0);
         let narrow = matches!(self.kernel, Kernel::Tent | Kernel::Interpolating);
@@ -341,7 +342,7 @@ pub struct Keep {
     pub gradients: bool,
 }
 
-/// How the work of a job is cut and scheduled. Never changes a byte.
+/// Schedule and division of the work of a job. Never changes a byte.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Work {

@@ -113,7 +113,7 @@ mod tests {
 
     #[test]
     fn split_gives_away_only_unfinished_work() {
-        // Of four parts the first two are done and the third is half way.
+        // The first two of four parts are done; the third is half done.
         let tile = Rect::new(0, 0, 128, 128);
         let todo = [0.0, 0.0, 0.5, 1.0];
         let left = |r: &Rect| {

@@ -215,7 +215,8 @@ struct OpacityRule {
     unit: OpacityUnit,
     /// Length of one vox of the level that is drawn, in world units.
     vox: f64,
-    /// The same in vox of level 0, of which an alpha is given.
+    /// Length of one vox of the drawn level, in vox of level 0. [`OpacityUnit::AlphaPerVox`] is per
+    /// vox of level 0.
     coarseness: f64,
     compositing: Compositing,
 }
@@ -266,14 +267,14 @@ pub struct Classifier {
     factors: Vec<f64>,
     /// Points of the opacity by gradient; empty if unmodulated.
     gradient_points: Vec<[f64; 2]>,
-    /// The points' unit of gradients, for a change by the values' range per vox.
+    /// Gradient in the points' unit of a change by the whole range of values per vox.
     gradient_per_share: f64,
 }
 
 /// Returns the value at `x` of the piecewise linear function through `points`, of which there is at
 /// least one. The first number of a point is its x.
 pub fn interpolate<const N: usize>(points: &[[f64; N]], x: f64) -> [f64; N] {
-    // The number of points at or left of x: of two points at one x the later one holds there.
+    // The number of points at or left of x. Where two points have one x, the later one holds.
     let after = points.partition_point(|p| p[0] <= x);
     if after == 0 {
         return points[0];
@@ -359,8 +360,8 @@ impl Classifier {
         c
     }
 
-    /// Returns the looks of a palette's codes: opacity by the colour's value, colour by the palette.
-    /// Codes beyond it have none.
+    /// Returns the optical samples of codes 0 to `codes` - 1 of a palette: opacity by the colour's
+    /// value, colour by the palette. Codes beyond the palette are invisible.
     fn looks_of(&self, palette: &Palette, codes: usize) -> Vec<OpticalSample> {
         let linear: Vec<f32> =
             (0..=255).map(|c| linear_from_srgb(f64::from(c) / 255.0) as f32).collect();
@@ -374,7 +375,8 @@ impl Classifier {
         looks
     }
 
-    /// Returns the value, as a code of the volume's samples, of a code that bricks hold.
+    /// Converts a code that bricks hold to a code of the volume's samples: a place in the palette
+    /// to the value of its colour, any other code to itself.
     #[inline]
     fn value_code(&self, code: f64) -> f64 {
         match &self.summary.palette {
@@ -406,9 +408,9 @@ impl Classifier {
         OpticalSample { sigma: self.rule.payload(a) as f32, rgb: [r as f32, g as f32, b as f32] }
     }
 
-    /// Returns extinction per vox and linear colour at a reconstructed value, given as a code that
-    /// need not be whole. Codes beyond the volume's smallest and largest have their look; NaN has
-    /// none.
+    /// Returns extinction per vox and linear colour `[sigma, r, g, b]` at a reconstructed value,
+    /// given as a code that need not be whole. Codes are clamped to the volume's smallest and
+    /// largest; NaN gives zeros.
     pub fn optics_at(&self, code: f64) -> [f64; 4] {
         if code.is_nan() {
             return [0.0; 4];
@@ -446,7 +448,7 @@ impl Classifier {
 
     fn modulated(&self, look: OpticalSample, brick: &Brick, i: usize) -> OpticalSample {
         let code = self.value_code(brick.values.code(i));
-        // Not a number has no border either.
+        // NaN and invisible voxels stay as they are.
         if code.is_nan() || look.sigma == 0.0 {
             return look;
         }
@@ -457,8 +459,8 @@ impl Classifier {
         OpticalSample { sigma: self.rule.payload(a * factor) as f32, ..look }
     }
 
-    /// Returns the factor of opacities where the value changes by `share` of its range per vox; 1 if
-    /// the transfer function does not depend on gradients.
+    /// Returns the factor of opacities where the value changes by `share` of its range per vox; 1
+    /// if the transfer function does not depend on gradients.
     pub fn gradient_factor(&self, share: f64) -> f64 {
         match &self.gradient_points[..] {
             [] => 1.0,
@@ -520,7 +522,7 @@ impl Classifier {
     }
 
     /// Returns the smallest extinction above zero, per vox, that occurs in the volume; `None` where
-    /// no table and histogram say so.
+    /// table and histogram do not tell it.
     fn faintest(&self) -> Option<f64> {
         if self.table.is_empty() || self.is_modulated() {
             return None;

@@ -1,8 +1,8 @@
 //! Bins of a volume's values, by which blocks and supports are compared.
 //!
-//! Blocks note which bins their samples lie in, and what a transfer function shows is rounded outward
-//! to whole bins. So an edit of a function within a bin changes no brick, and one beyond it changes
-//! those blocks alone that have values there.
+//! Blocks note which bins their samples lie in, and what a transfer function shows is rounded
+//! outward to whole bins. So an edit of a function within a bin changes no brick, and one beyond it
+//! changes those blocks alone that have values there.
 
 use crate::transfer::Support;
 use crate::volume::ValueSummary;
@@ -18,8 +18,8 @@ pub struct ValueBins {
 }
 
 impl ValueBins {
-    /// Returns bins over the values that nearly all samples have; of colours over the places in their
-    /// palette.
+    /// Returns bins over the values that nearly all samples have; of colours over the places in
+    /// their palette.
     pub fn of(summary: &ValueSummary) -> ValueBins {
         let (lo, hi) = match (&summary.palette, &summary.core) {
             (Some(palette), _) => (0.0, palette.colours().len() as f64),
@@ -45,9 +45,10 @@ impl ValueBins {
         })
     }
 
-    /// Returns a support grown to whole bins: the same for all supports with ends in the same bins. What
-    /// lies beyond the bins stays out unless `support` reaches there. An end stays as it is where growing
-    /// would add more than `ADDED_DIVISOR` allows of the samples that `summary` counts: air, above all.
+    /// Returns a support grown to whole bins, so that all supports with ends in the same bins give
+    /// one result. Codes beyond the bins are added only if `support` reaches there. An end is not
+    /// grown if that would add too many of the samples that `summary` counts (`ADDED_DIVISOR`):
+    /// air, above all.
     #[must_use]
     pub fn rounded(&self, support: &Support, summary: &ValueSummary) -> Support {
         let edge = |bin: u32| self.first_code + self.width * f64::from(bin);
@@ -84,7 +85,7 @@ mod tests {
         (a, f64::INFINITY)
     }
 
-    /// Bins of four codes, and a summary of 256 codes of which each has `counts(code)` samples.
+    /// Returns bins of four codes, and a summary of 256 codes with `counts(code)` samples each.
     fn bins(counts: impl Fn(usize) -> u64) -> (ValueBins, ValueSummary) {
         let counts: Vec<u64> = (0..256).map(counts).collect();
         let summary = ValueSummary::from_code_counts(SampleKind::U8, &counts, ValueMap::IDENTITY);

@@ -74,7 +74,7 @@ impl Samples {
         }
     }
 
-    /// Returns the bytes of a range of samples, little-endian: what [`VolumeHasher`] takes.
+    /// Returns a range of samples as little-endian bytes, the input of [`VolumeHasher`].
     ///
     /// # Panics
     /// If the range goes beyond the samples.
@@ -86,7 +86,8 @@ impl Samples {
         }
     }
 
-    /// Returns how many samples have each code, from 0 to the type's largest; `None` of floats.
+    /// Returns the number of samples with each code, from code 0 to the type's largest; `None` for
+    /// floats.
     pub fn code_counts(&self) -> Option<Vec<u64>> {
         match self {
             Samples::U8(v) => Some(counts_of(v, 1 << 8)),
@@ -141,7 +142,7 @@ impl Samples {
     }
 }
 
-/// Returns the little-endian bytes of numbers: mostly as they lie in memory.
+/// Returns the little-endian bytes of numbers, without a copy on little-endian machines.
 pub(crate) fn le_bytes<T: bytemuck::NoUninit, const N: usize>(
     numbers: &[T],
     bytes: impl Fn(&T) -> [u8; N],
@@ -152,10 +153,10 @@ pub(crate) fn le_bytes<T: bytemuck::NoUninit, const N: usize>(
     }
 }
 
-/// Returns how many of `samples` have each of `codes` codes.
+/// Returns the number of `samples` with each code from 0 to `codes` - 1.
 fn counts_of<T: Copy + Into<usize>>(samples: &[T], codes: usize) -> Vec<u64> {
-    // Four tables, since in a run of air each count would wait for the one before. A piece's counts fit 32
-    // bits.
+    // Four tables, since in a run of equal samples (air) each count would wait for the one before.
+    // The counts of a piece fit 32 bits.
     let mut counts = vec![0u64; codes];
     let mut tables = vec![[0u32; 4]; codes];
     for piece in samples.chunks(1 << 30) {
@@ -213,16 +214,16 @@ pub struct ValueSummary {
     pub nan: u64,
     /// Number of samples that are infinite (drawn as the nearest finite value).
     pub infinite: u64,
-    /// Whether the file says where the patient's right, anterior and superior are: its values are
-    /// then of a body.
+    /// Whether the file says where the patient's right, anterior and superior are. Such a volume
+    /// shows a body.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub anatomical: bool,
     /// Range of nearly all codes. Set if outliers or padding stretch the full range so far that it
     /// does not describe the rest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub core: Option<ValueCore>,
-    /// Colours of the voxels, if they have their own. Bricks then hold places in the palette, and all
-    /// above is about the palette's values.
+    /// Palette of a volume whose voxels have colours of their own. Bricks then hold places in the
+    /// palette; range, histogram and counts are of the palette's values.
     #[serde(skip)]
     pub palette: Option<Arc<Palette>>,
 }
@@ -234,16 +235,16 @@ pub struct ValueCore {
     pub min_code: f64,
     /// Upper end of the part, as a code; above `min_code`.
     pub max_code: f64,
-    /// Counts of finite samples in 256 equal bins between the ends; what lies beyond counts in the
-    /// first or the last bin.
+    /// Counts of finite samples in 256 equal bins between the ends. Samples beyond an end count in
+    /// the first or the last bin.
     pub histogram: Vec<u64>,
 }
 
 impl ValueSummary {
     /// Returns the range, the histogram and the counts of `samples`; `map` turns codes into values.
     pub fn from_samples(samples: &Samples, map: ValueMap) -> Self {
-        // Counted by code first: a bin needs a division, and there are 65536 codes at most but millions of
-        // samples.
+        // Counted by code first: a bin needs a division, and there are 65536 codes at most but
+        // millions of samples.
         let v = match (samples, samples.code_counts()) {
             (_, Some(counts)) => {
                 return ValueSummary::from_code_counts(samples.kind(), &counts, map);
@@ -286,7 +287,7 @@ impl ValueSummary {
         s
     }
 
-    /// Returns the summary of samples of 8 or 16 bits that were counted: `counts[c]` is the number of
+    /// Returns the summary of 8- or 16-bit samples from their counts: `counts[c]` is the number of
     /// samples of code c. It equals [`ValueSummary::from_samples`] of the same samples.
     ///
     /// # Panics
@@ -321,13 +322,16 @@ impl ValueSummary {
         s
     }
 
-    /// Finds the core of samples that do not lie in memory, and whose range, histogram and counts are
-    /// known. `count` counts the finite samples between two codes, each in the bin of
-    /// [`ValueSummary::core_bin`]; it is called only if ends of the range hold next to nothing, up to 41
-    /// times. The summary then equals [`ValueSummary::from_samples`] of the same samples.
+    /// Finds [`ValueSummary::core`] of samples that are not in memory. Range, histogram and counts
+    /// must be set.
+    ///
+    /// `count(lo, hi)` returns the finite samples in each of the 256 bins of
+    /// [`ValueSummary::core_bin`]. It is called only if an end of the range holds next to nothing,
+    /// and at most 41 times. The summary then equals [`ValueSummary::from_samples`] of the same
+    /// samples.
     ///
     /// # Errors
-    /// Those of `count`.
+    /// The first error that `count` returns.
     pub fn find_core<E>(
         &mut self,
         count: impl FnMut(f64, f64) -> Result<Vec<u64>, E>,
@@ -336,15 +340,15 @@ impl ValueSummary {
         Ok(())
     }
 
-    /// Returns the bin, 0 to 255, of a finite code in a count between two codes; what lies beyond is in
-    /// the first or the last.
+    /// Returns the bin, 0 to 255, of a finite code among 256 equal bins from `lo` to `hi`. Codes
+    /// below `lo` are in bin 0, codes above `hi` in bin 255.
     #[inline]
     pub fn core_bin(code: f64, lo: f64, hi: f64) -> usize {
         core::bin(code, lo, hi)
     }
 
-    /// Returns the number type of the codes that bricks hold and uploads send: of places in the palette,
-    /// if there is one.
+    /// Returns the number type of the codes that bricks hold and uploads send: 16 bits for places
+    /// in a palette, else [`ValueSummary::kind`].
     pub fn code_kind(&self) -> SampleKind {
         if self.palette.is_some() { SampleKind::U16 } else { self.kind }
     }
@@ -372,7 +376,8 @@ impl ValueSummary {
         (a.min(b), a.max(b))
     }
 
-    /// Returns the values between which nearly all samples lie: of the core, or else the range.
+    /// Returns the two values between which nearly all samples lie: the ends of the core, or of the
+    /// range if there is no core.
     pub fn core_range(&self) -> (f64, f64) {
         let Some(core) = &self.core else { return self.range() };
         let (a, b) = (self.map.value(core.min_code), self.map.value(core.max_code));
@@ -396,19 +401,21 @@ pub struct Volume {
     pub anatomical: bool,
     /// Lattice that the samples lie on.
     pub lattice: Lattice,
-    /// The samples, i fastest, then j, then k. Of voxels with colours of their own they are the
-    /// palette's values.
+    /// The samples, i fastest, then j, then k. For voxels with colours of their own these are the
+    /// values of their colours.
     pub samples: Samples,
-    /// Range, histogram, map from codes to values, and palette. Of a coarser level that of level 0.
+    /// Range, histogram, map from codes to values, and palette. A coarser level has the summary of
+    /// level 0.
     pub summary: ValueSummary,
-    /// Place among the levels of detail of a volume; `None` of level 0.
+    /// Place among the levels of detail of a volume; `None` for level 0.
     pub coarse: Option<CoarseLevel>,
-    /// Places of the voxels in the palette, if there is one: 16-bit codes, of the same order.
+    /// Places of the voxels in the palette, if there is one: 16-bit codes in the order of the
+    /// samples.
     pub places: Option<Samples>,
 }
 
-/// Place of a volume among the levels of detail of a finer one (docs/design/model.md, Levels of
-/// detail).
+/// Place of a coarser volume among the levels of detail of the volume that it was made from
+/// (docs/design/model.md, Levels of detail).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CoarseLevel {
     /// Number of the level, 1 or more.
@@ -444,7 +451,7 @@ impl Volume {
         }
     }
 
-    /// Returns a volume of voxels with colours of their own: `places` in `palette`.
+    /// Returns a volume whose voxels have colours of their own: each is a place in `palette`.
     ///
     /// # Errors
     /// A place is beyond the palette.
@@ -462,15 +469,15 @@ impl Volume {
         let values = Samples::U8(palette.values(&places)?);
         let mut volume =
             Volume::new(name, file_type, anatomical, lattice, values, ValueMap::IDENTITY);
-        // Outliers of brightness are a part of the picture.
+        // No core: bright and dark outliers belong to a picture.
         volume.summary.core = None;
         volume.summary.palette = Some(palette);
         volume.places = Some(Samples::U16(places));
         Ok(volume)
     }
 
-    /// Returns the codes that voxels are classified by, and that bricks hold and uploads send: places
-    /// in the palette if there is one, else the samples.
+    /// Returns the codes that voxels are classified by, and that bricks hold and uploads send:
+    /// places in the palette if there is one, else the samples.
     pub fn codes(&self) -> &Samples {
         self.places.as_ref().unwrap_or(&self.samples)
     }
@@ -495,9 +502,9 @@ impl Volume {
         Volume::new(name, "uint8", false, lattice, Samples::U8(v), ValueMap::IDENTITY)
     }
 
-    /// Returns the SHA-256 over lattice, value map, palette and codes; of a coarser level also over
-    /// what level 0 gives it. Two volumes with one digest give the same pictures; the name is not part
-    /// of it.
+    /// Returns the SHA-256 over lattice, value map, palette and codes. A coarser level adds its
+    /// number, and the vox and the summary that it has from level 0. Two volumes with one digest
+    /// give the same pictures; names do not count.
     pub fn digest(&self) -> Digest32 {
         let mut hasher = VolumeHasher::of(&self.lattice, &self.summary);
         let codes = self.codes();
@@ -553,8 +560,8 @@ impl Volume {
 pub struct VolumeHasher(Sha256);
 
 impl VolumeHasher {
-    /// Starts the digest of a volume on `lattice` whose codes have the type, the map to values and the
-    /// palette of `summary`.
+    /// Starts the digest of a volume on `lattice` whose codes have the type, the map to values and
+    /// the palette of `summary`.
     pub fn of(lattice: &Lattice, summary: &ValueSummary) -> VolumeHasher {
         let mut hasher = VolumeHasher::new(lattice, summary.map, summary.code_kind());
         if let Some(palette) = &summary.palette {
@@ -563,8 +570,8 @@ impl VolumeHasher {
         hasher
     }
 
-    /// Starts the digest of a volume without palette on `lattice`, whose codes have type `kind` and stand
-    /// for the values that `map` gives.
+    /// Starts the digest of a volume without palette on `lattice`, whose codes have type `kind` and
+    /// stand for the values that `map` gives.
     pub fn new(lattice: &Lattice, map: ValueMap, kind: SampleKind) -> VolumeHasher {
         let mut h = Sha256::new();
         h.update(b"slabcast volume 1");
@@ -598,8 +605,8 @@ impl VolumeHasher {
         Digest32(self.0.finalize().into())
     }
 
-    /// Returns the digest of a coarser level whose samples were added. `summary` is that of level 0,
-    /// of which range and opacities are.
+    /// Returns the digest of a coarser level whose samples were added. `summary` is the summary of
+    /// level 0, which decides range and opacities.
     pub fn finish_level(mut self, coarse: &CoarseLevel, summary: &ValueSummary) -> Digest32 {
         self.0.update(b"level");
         self.0.update(coarse.level.to_le_bytes());
@@ -620,22 +627,23 @@ pub struct VolumeInfo {
     pub digest: Digest32,
     /// Lattice that the samples lie on.
     pub lattice: Lattice,
-    /// Range, histogram, and map from codes to values; of each level those of level 0.
+    /// Range, histogram, and map from codes to values. Each level has the summary of level 0.
     pub summary: ValueSummary,
     /// Level of detail: 0 is the volume as it was read, each level after it is coarser.
     pub level: u32,
-    /// Length of one vox of level 0 in world units; of level 0 itself [`Lattice::vox`].
+    /// Length of one vox of level 0 in world units; equals [`Lattice::vox`] at level 0.
     pub finest_vox: f64,
 }
 
 impl VolumeInfo {
-    /// Returns the place among the levels of detail; `None` of level 0.
+    /// Returns the place among the levels of detail; `None` for level 0.
     pub fn coarse(&self) -> Option<CoarseLevel> {
         let (level, finest_vox) = (self.level, self.finest_vox);
         (level > 0).then_some(CoarseLevel { level, finest_vox })
     }
 
-    /// Returns [`Volume::digest`] of a volume with this description, whose samples `hasher` was given.
+    /// Returns [`Volume::digest`] of the volume with this description. `hasher` must have been
+    /// given all its samples.
     pub fn finish(&self, hasher: VolumeHasher) -> Digest32 {
         match self.coarse() {
             None => hasher.finish(),
@@ -643,10 +651,10 @@ impl VolumeInfo {
         }
     }
 
-    /// Returns the length of a vox of this level in vox of level 0; exactly 1 of level 0.
+    /// Returns the length of one vox of this level in vox of level 0; exactly 1 at level 0.
     ///
-    /// Opacities and gradients of transfer functions are per vox of level 0. Whatever is counted per
-    /// vox of this level is multiplied or divided by this.
+    /// Transfer functions give opacities and gradients per vox of level 0. Quantities per vox of
+    /// this level are converted by this factor.
     pub fn coarseness(&self) -> f64 {
         if self.level == 0 { 1.0 } else { self.lattice.vox() / self.finest_vox }
     }

@@ -157,7 +157,7 @@ fn error(
     stats.accumulation.bound = Some(bounds::accumulation(view, within));
     stats.rounding.bound = bounds::rounding(scene, view, within, max_alpha).and_then(says);
     stats.truncation.bound = bounds::truncation(scene, view, within, max_alpha).and_then(says);
-    // Where solids hide everything behind them, a few pixels at their edges decide, and a sample
+    // If solids hide everything behind them, a few pixels at their edges decide, and a sample
     // misses those.
     if max_alpha.is_some_and(|a| 1.0 - a < scene.quality.eps) {
         stats.truncation.estimate = None;

@@ -30,8 +30,8 @@ const PLANS_AT_ONCE: usize = 2;
 /// Events that wait for the driver before whoever sends one has to wait.
 const INBOX: usize = 1024;
 
-/// Calls at a time that look at folders or write a piece of an upload. They wait for no file that is
-/// being read.
+/// Most calls at a time that look at folders or write a piece of an upload. They don't wait for
+/// files that are being read.
 const LOOKS_AT_ONCE: usize = 4;
 
 /// Settings of a master: its volumes, memory, scheduler and record.
@@ -49,8 +49,8 @@ pub struct MasterConfig {
     /// Recorder of the scheduler's events and decisions ([`crate::record::start`]).
     pub record: Option<Recorder>,
     /// Share of the tiles of workers over TCP which another worker draws too, to compare, in
-    /// millionths, once each has agreed with others some times; 0: never. `None`: 1 %, of workers on
-    /// other machines.
+    /// millionths, once each has agreed with others some times; 0: never. `None`: 1 %, of workers
+    /// on other machines.
     pub audit_ppm: Option<u32>,
     /// Time for which a worker is not let in after it drew other pixels than others.
     pub shut_out: Duration,
@@ -197,8 +197,8 @@ impl Handle {
         self.with_library(&self.planning, run).await
     }
 
-    /// Runs what looks at folders or writes a piece of an upload, on a blocking thread; at most
-    /// [`LOOKS_AT_ONCE`] run at a time. `None` if the master is gone.
+    /// Runs a call that looks at folders or writes a piece of an upload on a blocking thread; at
+    /// most [`LOOKS_AT_ONCE`] run at a time. `None` if the master has ended.
     pub(crate) async fn looking<T: Send + 'static>(
         &self,
         run: impl FnOnce(&Library) -> T + Send + 'static,
@@ -243,10 +243,12 @@ impl Handle {
         self.submit_from(request, None).await
     }
 
-    /// Submits a view path, as [`Handle::submit`], for a client that calls from `peer`.
+    /// Submits a view path for a client that calls from `peer`; otherwise equal to
+    /// [`Handle::submit`].
     ///
     /// # Errors
-    /// As [`Handle::submit`].
+    /// [`SubmitError::Refused`] names a field that can't be used; the others say why the master
+    /// takes no such job now.
     pub async fn submit_from(
         &self,
         request: PathRequest,
@@ -350,8 +352,8 @@ impl Handle {
         self.inbox.send(Event::Said { worker, message, _place: place }).await.is_ok()
     }
 
-    /// Tells the driver that a worker's link has ended, and why. `is_damage`: the line was at fault,
-    /// so that no tile is suspected of it.
+    /// Tells the driver that a worker's link has ended, and why. `is_damage`: the line was at
+    /// fault, so that no tile is suspected of it.
     pub async fn detach(&self, worker: WorkerId, reason: String, is_damage: bool) {
         let _ = self.inbox.send(Event::Detached { worker, reason, is_damage }).await;
     }

@@ -88,7 +88,8 @@ pub(crate) async fn bricks_of<T: Send + 'static>(
 /// bounded by what the driver sends:
 pub struct WorkerLink {
     /// Control messages: at most the leases that the scheduler has lent the worker and, until
-    /// silence ends the link, its pings (`4 * Config::silence / Config::unresponsive_after`, 12 by default).
+    /// silence ends the link, its pings (`4 * Config::silence / Config::unresponsive_after`, 12 by
+    /// default).
     pub control: mpsc::UnboundedSender<ToWorker>,
     /// Orders for bricks: at most one for each brick that the worker lacks, as no brick is ordered
     /// twice.
@@ -97,8 +98,8 @@ pub struct WorkerLink {
     pub damaged: Damaged,
 }
 
-/// Number of messages that were damaged on their way over a link, in either direction. The first of
-/// a link is told in the log.
+/// Number of messages that were damaged on their way over a link, in either direction. The first
+/// one of a link is logged.
 #[derive(Clone, Debug, Default)]
 pub struct Damaged(Arc<Counter>);
 
@@ -133,9 +134,9 @@ impl Damaged {
     }
 }
 
-/// Places of one worker in the driver's inbox: a turn of the driver handles no more of it, and whoever
-/// else has something to say waits for no more. At a quarter of it, the driver would have to wake a
-/// link within a turn to have the results of 64 threads in one turn.
+/// Places of one worker in the driver's inbox: a turn of the driver handles no more of it, and
+/// whoever else has something to say waits for no more. At a quarter of it, the driver would have
+/// to wake a link within a turn to have the results of 64 threads in one turn.
 const PLACES: usize = 64;
 
 /// Places that a message takes: one, and one more for each 128 bricks that it names (12 us of the
@@ -186,10 +187,10 @@ impl Caller {
         if machine.is_empty() || own.is_empty() { self.is_local } else { machine == own }
     }
 
-    /// Whether a caller that says to be on `machine` is surely on that of a master on `own`, so that
-    /// its pixels need no audit: it is of this process, or calls from the address that it calls and
-    /// names the machine. Either alone can be had by a stranger: the address through a tunnel or a
-    /// published port, the name from whoever knows it.
+    /// Whether a caller that says to be on `machine` is surely on that of a master on `own`, so
+    /// that its pixels need no audit: it is of this process, or calls from the address that it
+    /// calls and names the machine. Either alone can be had by a stranger: the address through a
+    /// tunnel or a published port, the name from whoever knows it.
     pub(crate) fn is_surely_on(&self, machine: &str, own: &str) -> bool {
         self.address.is_empty() || self.is_local && !own.is_empty() && machine == own
     }

@@ -123,7 +123,7 @@ async fn framing_is_told_once_it_is_asked_for() {
     let told = render.submit_path(ask.clone()).await.unwrap().into_inner();
     let framing = told.framing.expect("it was asked for");
     assert!((1.0..40.0).contains(&framing.height) && framing.target.is_some(), "{framing:?}");
-    // The same key is the same request, with the same answer.
+    // A repeated key is a repeated request and gets the first answer.
     let again = render.submit_path(ask.clone()).await.unwrap().into_inner();
     assert_eq!((again.job_id, again.framing), (told.job_id, Some(framing)));
     ask.client_key = "c".into();

@@ -106,7 +106,7 @@ pub struct VolumeEntry {
     pub read: Option<(Digest32, [u32; 3], SampleKind)>,
     /// Bytes of the samples, or of the file while it was not read; 0 of a folder.
     pub bytes: u64,
-    /// Where it comes from.
+    /// Origin of the volume.
     pub origin: VolumeOrigin,
     /// Whether its samples are in memory.
     pub in_memory: bool,
@@ -127,7 +127,7 @@ pub struct VolumeList {
     pub now_unix_ms: i64,
 }
 
-/// Where a volume of a master comes from.
+/// Origin of a volume of a master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum VolumeOrigin {
     /// The master was started with it.
@@ -154,7 +154,7 @@ pub struct VolumeHeader {
 /// A part of an upload.
 #[derive(Clone, Debug, PartialEq)]
 pub enum UploadPart {
-    /// What is uploaded.
+    /// Header of the volume that is uploaded.
     Begin(Box<VolumeHeader>),
     /// Bytes of its samples.
     Chunk {

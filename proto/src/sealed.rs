@@ -52,8 +52,8 @@ const WINDOW_MESSAGES: usize = 8192;
 const ACKNOWLEDGE_MESSAGES: u32 = 16;
 const ACKNOWLEDGE_BYTES: usize = WINDOW_BYTES / 8;
 
-/// How often a message is asked for before the stream counts as hopeless. On a line that damages a
-/// fifth of all messages, 40 in a row are damaged once in 10^28 messages.
+/// Number of requests for a message after which the stream counts as hopeless. On a line that
+/// damages a fifth of all messages, 40 in a row are damaged once in 10^28 messages.
 pub const MOST_TRIES: u32 = 40;
 
 /// Time without a message after which one that was asked for is asked for again. On a loopback an
@@ -148,9 +148,9 @@ struct State {
     /// Messages that are not acknowledged; the first has the number `acknowledged + 1`.
     kept: VecDeque<Kept>,
     kept_bytes: usize,
-    /// How many of `kept` were sent since the last request.
+    /// Number of messages in `kept` that were sent since the last request.
     sent: usize,
-    /// How many of `kept` were ever sent.
+    /// Number of messages in `kept` that were ever sent.
     ever_sent: usize,
     acknowledged: u64,
     /// Requests of the peer that were answered, and how many of them in a row.
@@ -226,7 +226,7 @@ impl State {
         let whole = |s: &Sealed| s.crc32c == checksum(s, crc32c::crc32c(&s.payload));
         let Some(sealed) = sealed.filter(whole) else {
             self.damaged += 1;
-            // Of a damaged message nobody knows whether it was sent before the request or after.
+            // A damaged message may have been sent before the request or after it.
             return if self.is_waiting { Ok(None) } else { self.ask().map(|()| None) };
         };
         self.hear(&sealed)?;

@@ -44,7 +44,7 @@ fn every_call_message_and_field_has_a_comment() {
             }
             for (j, field) in message.field.iter().enumerate() {
                 let name = format!("{}.{}", message.name(), field.name());
-                // Of fields that follow each other and are alike, the first speaks for all.
+                // In a run of fields with one type, the comment of the first holds for all.
                 let alike = j > 0 && message.field[j - 1].type_name == field.type_name;
                 if !(alike && field.type_name().ends_with("SampledError")) {
                     check(&[4, i, 2, j], &name);

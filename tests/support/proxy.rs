@@ -77,7 +77,7 @@ impl Noise {
     }
 }
 
-/// Where a stream is within its gRPC messages.
+/// Position of a stream within its gRPC messages.
 #[derive(Default)]
 struct Grpc {
     head: Vec<u8>,

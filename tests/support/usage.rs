@@ -90,7 +90,7 @@ pub(crate) fn slope(samples: &[Sample], figure: impl Fn(&Sample) -> f64) -> f64 
     if below > 0.0 { above / below } else { 0.0 }
 }
 
-/// How much the line through a figure of samples rises from the first to the last of them.
+/// Returns the rise, from the first sample to the last, of the line fitted to a figure of samples.
 pub(crate) fn growth(samples: &[Sample], figure: impl Fn(&Sample) -> f64) -> f64 {
     let [first, .., last] = samples else { return 0.0 };
     slope(samples, figure) * (last.at - first.at).as_secs_f64() / 3600.0

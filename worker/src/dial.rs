@@ -74,11 +74,12 @@ pub async fn run(
     run_with(config, BrickCache::default(), master, stop).await
 }
 
-/// Serves a master like [`run`], with a cache of the caller's: one with a limit of memory, or with
-/// bricks.
+/// Serves the master at `master` (`host:port`) with the caller's brick cache, which may have a
+/// limit of memory or bricks, until `stop` turns true or the master refuses this worker. An absent
+/// master is dialled for ever.
 ///
 /// # Errors
-/// Those of [`run`].
+/// [`DialError`] if the address can't be one, or the system gives no threads.
 pub async fn run_with(
     config: Config,
     mut cache: BrickCache,
@@ -113,7 +114,7 @@ pub async fn run_with(
                         warn!(master, reason, "link lost, dialling again");
                         told = false;
                     }
-                    // What answers there may be no master, and then each try ends so.
+                    // The address may not be a master's; then every attempt ends this way.
                     Ended::Lost(reason) => {
                         if !std::mem::replace(&mut told, true) {
                             warn!(
@@ -256,7 +257,7 @@ async fn carry(
     control: mpsc::UnboundedSender<ToWorker>,
     bricks: mpsc::Sender<convert::Bricks>,
 ) -> Result<(), Broken> {
-    // How results are compressed, by the frame that came last.
+    // Whether results are sent uncompressed, as the last frame asked.
     let uncompressed = Arc::new(AtomicBool::new(false));
     // Encoded on this runtime thread: handing a message to another thread and back takes some 25
     // us (docs/design/transport.md section 0), and the message of a 64x64 tile 35 us. Of the

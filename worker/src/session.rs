@@ -37,13 +37,13 @@ use waiting::{WaitingLease, WaitingLeases};
 const DRAIN: Duration = Duration::from_secs(8);
 
 /// Longest time that bricks which tasks wait for may stay away without a single brick coming. The
-/// Bricks stream has a connection of its own, which may stall (a router that swallows large packets)
-/// while pings go on. At half of it, a busy master's pause ends links; at double, a frame waits as
-/// much longer. A link of less than 200 kb/s can't bring a batch in this time.
+/// Bricks stream has a connection of its own, which may stall (a router that swallows large
+/// packets) while pings go on. At half of it, a busy master's pause ends links; at double, a frame
+/// waits as much longer. A link of less than 200 kb/s can't bring a batch in this time.
 const BRICKS_OVERDUE: Duration = Duration::from_secs(3);
 
-/// How often a worker looks whether bricks are overdue. It counts looks and not time, so that a
-/// process that was stopped does not blame its master.
+/// Number of looks for bricks in [`BRICKS_OVERDUE`]; after so many in vain, bricks are overdue. A
+/// worker counts looks and not time, so that a process that was stopped does not blame its master.
 const LOOKS: u32 = 12;
 
 /// Longest time that a master may take to answer the hello.

@@ -256,7 +256,7 @@ impl Stalls {
             // No regions: the schedule is `slab`, and the master keeps this worker's budget.
             return requests;
         }
-        // Of sets without a directory nothing is drawn, and their bricks go first.
+        // Sets without a directory are not drawn, so their bricks are dropped first.
         let sets = self.last_used.len();
         self.last_used.retain(|set, _| cache.table(*set).is_some());
         if self.last_used.len() < sets {

@@ -28,8 +28,8 @@ const LARGEST: u32 = 4096;
 
 /// Draws two volumes side by side under one look.
 ///
-/// --tf is fitted to A and used for both, and both are shown at one scale. Several --view's stand below
-/// each other.
+/// --tf is fitted to A and used for both, and both are shown at one scale. Several --view's stand
+/// below each other.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -183,7 +183,7 @@ fn frame(halves: &mut [Half; 2]) -> Result<(), Fail> {
     for half in halves.iter() {
         let Half { request, volume, info, transfer, orientation, .. } = half;
         let one = framing::framing(&request.path, volume, info, transfer, *orientation);
-        // Where nothing is seen the whole volume is framed.
+        // If nothing is visible, the whole volume is framed.
         let lattice = &info.lattice;
         let (target, height) = (lattice.centre().to_array(), 1.25 * lattice.largest_extent());
         let usual = Framing { target, height };
@@ -200,7 +200,7 @@ fn frame(halves: &mut [Half; 2]) -> Result<(), Fail> {
             continue;
         }
         let framing = if shared {
-            // What one needs about the common middle.
+            // High enough for either half about the common middle.
             Framing { target: middle, height: height + apart }
         } else {
             Framing { target: own.target, height }

@@ -17,7 +17,7 @@ use std::path::Path;
 /// Edge of each picture in pixels: a face is told from the back of a head.
 const EDGE: u32 = 192;
 
-/// The pairs of up and front, up after up.
+/// Returns all pairs of an up axis and a front axis, ordered by the up axis.
 fn guesses() -> Vec<Orientation> {
     let all = || (0..6).map(|i| Axis { index: i / 2, negative: i % 2 == 1 });
     let ups = [2, 1, 0].into_iter().flat_map(move |i| all().filter(move |a| a.index == i));
@@ -33,7 +33,7 @@ fn guesses() -> Vec<Orientation> {
 /// The picture can't be drawn or written.
 pub(crate) fn draw(volume: &Volume, info: &VolumeInfo, path: &Path) -> Result<(), Fail> {
     let size = [EDGE; 2];
-    // What all six sides need, so that no guess is cut off.
+    // One framing for all six sides, so that no guess is cut off.
     let sides = Side::NAMES.map(|(_, side)| Key { view: Some(side), ..Key::default() });
     let keys = KeyFrames {
         frames: 6,

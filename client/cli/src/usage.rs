@@ -30,7 +30,7 @@ pub(crate) fn understood(e: &clap::Error) -> Fail {
 /// Returns clap's paragraphs as one line: what is wrong, its tips, and where to read on.
 fn one_sentence(text: &str, typed: &[String]) -> String {
     let mut parts: Vec<String> = Vec::new();
-    // Where clap prints no usage, the words that were typed tell the command.
+    // If clap prints no usage, the command is found from the words that were typed.
     let program = command();
     let (mut named, mut help) = (&program, "slabcast".to_string());
     for word in typed {

@@ -1,7 +1,7 @@
 //! `slabcast worker`: renders for a master.
 //!
-//! Like a master it tells systemd how it is, and stops gracefully on SIGTERM or Ctrl-C. When its
-//! master is away it dials until the master is back.
+//! It reports its state to systemd, and stops gracefully on SIGTERM or Ctrl-C, as a master does. If
+//! its master is away, it dials until the master is back.
 
 use crate::systemd::{self, DRAIN};
 use slabcast_lab::plan;

@@ -1,8 +1,8 @@
 //! Charts as SVG and as PNG, on a light and on a dark ground.
 //!
 //! Drawn by plotters: its SVG writer, and its bitmap writer, whose letters are our own
-//! ([`slabcast_session::letters`]). One drawing function serves both; [`Sheet`] hides the writer and the size
-//! of a pixel. Text is measured in the same font, so that labels never overlap.
+//! ([`slabcast_session::letters`]). One drawing function serves both; [`Sheet`] hides the writer
+//! and the size of a pixel. Text is measured in the same font, so that labels never overlap.
 
 use plotters::coord::Shift;
 use plotters::prelude::*;
@@ -93,7 +93,7 @@ pub(crate) struct Sheet<'a, DB: DrawingBackend> {
 /// Size of text in ems, for one of plotters, which gives SVG viewers this much.
 const EM: f64 = 1.0 / 1.24;
 
-/// How far the middle of small letters is above the base line, for a size of plotters.
+/// Height of the middle of small letters above the base line, as a share of the font size.
 const MIDDLE: f64 = 0.22;
 
 /// The part of a text that is at its position.

@@ -1,4 +1,4 @@
-//! The laboratory: how far pictures are from the truth, what they cost, and what clusters do.
+//! The laboratory: measures the error of pictures, their cost, and the behaviour of clusters.
 //!
 //! One module per subcommand of `slabcast lab`; each has its arguments and a `run` function:
 //!

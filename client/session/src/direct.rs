@@ -20,7 +20,7 @@ use std::ops::Deref;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// How a picture is cut for threads; never changes a byte.
+/// Division of a picture among threads; never changes a byte.
 #[derive(Clone, Copy, Debug)]
 pub struct Cut {
     /// Number of threads that draw at once.
@@ -101,8 +101,8 @@ pub fn tile_rects(whole: Rect, edge: u32) -> impl Iterator<Item = Rect> {
     corners.map(move |(x, y)| Rect::new(x, y, x + edge, y + edge).intersect(&whole))
 }
 
-/// Draws a whole frame and returns the work of each pixel with it, that of sections only if they are
-/// asked for.
+/// Draws a whole frame; returns it with the work of each pixel. Sections are counted only if they
+/// are asked for.
 pub fn draw_with_work(
     frame: &Frame,
     bricks: &Bricks,
@@ -120,8 +120,8 @@ pub fn draw_with_work(
     (picture, all)
 }
 
-/// Draws each tile through all sheets by `draw`, as a cluster's workers do, into the thread's memory.
-/// Returns the results in the order in which tiles were drawn.
+/// Draws each tile through all sheets by `draw`, as a cluster's workers do, into the thread's
+/// memory. Returns the results in the order in which tiles were drawn.
 fn through<T: Send>(
     frame: &Frame,
     bricks: &Bricks,

@@ -1,4 +1,4 @@
-//! How a command ends badly: an exit code and one line that names what and what to do.
+//! Failure of a command: an exit code, and one line that names the problem and its remedy.
 //!
 //! Exit code 2: the command line is wrong. 1: everything else that went wrong. 130 and 143:
 //! stopped by Ctrl-C or SIGTERM before the end.

@@ -58,8 +58,9 @@ fn mix(p: [[f32; 4]; 4], w: [f32; 4]) -> [f32; 4] {
     sum
 }
 
-/// Of the `i`-th of `by` pixels that one small pixel becomes: where its four sources begin, counted
-/// from that small pixel, and their weights.
+/// Returns the four source pixels of a magnified pixel, the `i`-th of the `by` pixels that one
+/// small pixel becomes along an axis: the position of the first source, counted from the small
+/// pixel, and the weights of all four.
 fn phase(i: usize, by: usize) -> (isize, [f32; 4]) {
     // Centres: of the large pixel in units of small ones, from the small pixel's own.
     let at = (i as f64 + 0.5) / by as f64 - 0.5;

@@ -80,7 +80,7 @@ impl SceneBricks {
 pub struct PathScenes {
     request: RenderRequest,
     orientation: Orientation,
-    /// Of all frames, or of those of a tween but for the transfer function.
+    /// Scene of all frames. With a tween, each frame replaces its transfer function.
     base: SceneSpec,
     tween: Option<Tween>,
     /// Scene of all frames if there is no tween; it caches footprints.

@@ -64,11 +64,12 @@ pub async fn describe(client: &Client, choice: &VolumeChoice) -> Result<VolumeDe
     Ok(served)
 }
 
-/// Puts a volume on a master, unless it has it. If another volume there has its name, it gets one with
-/// digits of its digest. `told` is called with the bytes that the master has and those of all samples.
+/// Uploads a volume to a master that does not have it yet. If the master has another volume of this
+/// name, digits of the digest are added to it. `told` is called with the bytes that the master has
+/// and the bytes of all samples.
 ///
 /// # Errors
-/// The master refuses the volume, or stays away.
+/// The master refuses the volume, or can't be reached for too long.
 pub async fn put(
     client: &Client,
     volume: &Volume,

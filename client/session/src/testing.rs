@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 /// Returns the path of a file in the data folder beside the repository, `shared/data`.
 ///
-/// Where the file is missing it says so on stderr, also when the output of tests is captured, and
+/// If the file is missing, it prints so on stderr, even when the output of tests is captured, and
 /// returns `None`: the test ends early.
 pub fn data_file(name: &str) -> Option<PathBuf> {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data").join(name);

@@ -140,8 +140,8 @@ impl Transfer {
         }
     }
 
-    /// Returns the function as it is for another volume, in that volume's values, with the changes of
-    /// flags.
+    /// Returns the function as it is for another volume, in that volume's values, with the changes
+    /// of flags.
     ///
     /// # Errors
     /// It doesn't fit that volume.
@@ -231,7 +231,7 @@ impl Transfer {
         match (self.function(info), &self.base) {
             (Ok(tf), TransferChoice::Function(_)) => TransferChoice::Function(Box::new(tf)),
             (Ok(tf), _) if changed => TransferChoice::Function(Box::new(tf)),
-            // What can't be made is refused by the master in the words of `fit`.
+            // A function that can't be made is refused by the master with the error of `fit`.
             _ => self.base.clone(),
         }
     }
@@ -239,8 +239,8 @@ impl Transfer {
 
 /// Returns a function over shares of a volume's range as one over its values, for people to change.
 ///
-/// Points are off by what a rounding of the last digit makes of them. [`Transfer::function`] knows a
-/// preset that was not changed by its numbers, and draws it to the bit.
+/// Points are off by what a rounding of the last digit makes of them. [`Transfer::function`] knows
+/// a preset that was not changed by its numbers, and draws it to the bit.
 pub fn in_values(tf: &TransferFunction, info: &VolumeInfo) -> TransferFunction {
     if tf.domain == Domain::Value {
         return tf.clone();
@@ -258,8 +258,8 @@ pub fn in_values(tf: &TransferFunction, info: &VolumeInfo) -> TransferFunction {
     }
 }
 
-/// Returns the preset whose numbers, in this volume's values, are exactly those of a function that
-/// was read from a file; `None` if there is none.
+/// Returns the preset that gives exactly the numbers of a function from a file, in this volume's
+/// values; `None` if no preset does.
 fn printed_preset(tf: &TransferFunction, info: &VolumeInfo) -> Option<TransferFunction> {
     if tf.domain != Domain::Value {
         return None;

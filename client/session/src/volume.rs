@@ -1,5 +1,5 @@
-//! Opening volumes: what a person can say of a file that it does not say itself, and the sentence
-//! for each way in which that fails.
+//! Opens the volume of a command: the flags for facts that a file does not hold itself, the folder
+//! for facts found by earlier runs, and an error message for each way in which opening fails.
 
 use crate::fail::Fail;
 use crate::parse;
@@ -33,7 +33,8 @@ pub struct InputArgs {
     #[arg(long, value_name = "ORDER", value_parser = parse::byte_order, help_heading = HEADING,
           hide_short_help = true)]
     byte_order: Option<bool>,
-    /// Distances of samples of raw numbers, pictures or NumPy arrays, such as 0.5x0.5x1.25 [default: 1x1x1]
+    /// Distances of samples of raw numbers, pictures or NumPy arrays, such as 0.5x0.5x1.25
+    /// [default: 1x1x1]
     #[arg(long, value_name = "AxBxC", value_parser = parse::spacing, help_heading = HEADING,
           hide_short_help = true)]
     spacing: Option<[f64; 3]>,
@@ -45,7 +46,8 @@ pub struct InputArgs {
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     series: Option<String>,
-    /// Which array of a file of several (.npz, .vti, .vtk): its name [default: the only one, or the first]
+    /// Which array of a file of several (.npz, .vti, .vtk): its name [default: the only one, or the
+    /// first]
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     dataset: Option<String>,
@@ -126,8 +128,8 @@ impl InputArgs {
         self.level.unwrap_or_default()
     }
 
-    /// Returns the level of detail to draw of a source: without a flag all detail of a volume in memory
-    /// or of less than 1 GiB, and `auto` of others.
+    /// Returns the level of detail to draw of a source. Without `--level` it is level 0 for a
+    /// volume in memory or of less than 1 GiB, and `auto` for others.
     pub fn level_of(&self, source: &dyn BlockSource) -> LevelChoice {
         let finest = &source.levels()[0];
         let bytes = finest.lattice.len() as u64 * finest.summary.kind.bytes() as u64;
@@ -145,11 +147,12 @@ impl InputArgs {
         Ok(opened.volume)
     }
 
-    /// Opens a volume like [`InputArgs::open`] as a source of boxes: in memory, or, of a large pyramid,
-    /// in its file. Prints notes, and the progress of a first look at all samples.
+    /// Opens a file, a folder or a `formula:` volume as a source of boxes. A large pyramid stays in
+    /// its file; other volumes are read into memory. Prints notes, and the progress of the first
+    /// pass over all samples.
     ///
     /// # Errors
-    /// Those of [`InputArgs::open`].
+    /// The volume can't be read; the error names file and remedy.
     pub fn open_source(&self, path: &Path) -> Result<OpenedSource, Fail> {
         let mut bar = None;
         let mut told = |there: u64, total: u64| {
@@ -165,11 +168,11 @@ impl InputArgs {
         Ok(opened)
     }
 
-    /// Opens a volume like [`InputArgs::open`], to write it: with the file's own numbers where the
-    /// volume's codes round them.
+    /// Opens a file, a folder or a `formula:` volume to write it in another format. Returns the
+    /// file's own numbers, too, where the volume's codes round them.
     ///
     /// # Errors
-    /// Those of [`InputArgs::open`].
+    /// The volume can't be read; the error names file and remedy.
     pub fn open_numbers(&self, path: &Path) -> Result<(Volume, Option<FileNumbers>), Fail> {
         let opened = slabcast_volumes::open_numbers(path, &self.hints());
         let (opened, numbers) = opened.map_err(|e| Fail::failed(e.to_string()))?;
@@ -179,8 +182,8 @@ impl InputArgs {
 }
 
 impl InputArgs {
-    /// Reads a file or folder whose samples take at most `most_bytes`, or as many as `--max-bytes` says
-    /// if that is less. Returns it with the reader's notes.
+    /// Reads a file or folder whose samples take at most `most_bytes`, or at most `--max-bytes` if
+    /// that is less. Returns the volume with the reader's notes.
     ///
     /// # Errors
     /// The volume can't be read.
@@ -197,11 +200,12 @@ impl InputArgs {
 
 #[cfg(feature = "zarr")]
 impl InputArgs {
-    /// Writes a volume as OME-Zarr with all levels into the folder `to`. With `replace`, a Zarr folder
-    /// that is there goes when the new one is whole. `on_progress` hears of bytes that are done and all.
+    /// Writes a volume as OME-Zarr with all levels into the folder `to`. With `replace`, a Zarr
+    /// folder at `to` is removed once the new one is complete. `on_progress` is called with the
+    /// bytes done and the bytes in all.
     ///
     /// # Errors
-    /// The volume can't be read, or the folder not be written; `on_progress` returned an error.
+    /// The volume can't be read, the folder can't be written, or `on_progress` returned an error.
     pub fn convert(
         &self,
         from: &Path,
@@ -217,8 +221,8 @@ impl InputArgs {
     }
 }
 
-/// Bytes of samples from which a volume's level is `auto` unless a flag says more: drawing all detail
-/// of it reads gigabytes.
+/// Bytes of samples from which a volume is drawn at level `auto` by default: level 0 would read
+/// gigabytes.
 const AUTO_FROM_BYTES: u64 = 1 << 30;
 
 /// A volume that was opened to be served.
@@ -236,10 +240,11 @@ impl OpenedSource {
         &self.source.levels()[0]
     }
 
-    /// Returns the volume for what needs all samples in memory; `flags` ask for it.
+    /// Returns the volume for a command that needs all samples in memory. `flags` are the flags
+    /// that need them, for the error message.
     ///
     /// # Errors
-    /// The volume is read from its file, block by block.
+    /// The volume is not in memory: its file is read block by block.
     pub fn whole(&self, flags: &str) -> Result<Arc<Volume>, Fail> {
         self.volume.clone().ok_or_else(|| {
             let name = self.source.name();
@@ -251,9 +256,9 @@ impl OpenedSource {
     }
 }
 
-/// Opens a volume in memory; a large pyramid, and a volume that doesn't fit, by blocks. `packed` says
-/// whether a packed file that doesn't fit is converted. `on_progress` gets the bytes looked at and
-/// those in all.
+/// Opens a volume: by blocks if it is a large pyramid or does not fit into memory, else in memory.
+/// Returns it with the reader's notes. `packed` says whether a packed file that does not fit is
+/// converted. `on_progress` is called with the bytes surveyed and the bytes in all.
 fn source(
     path: &Path,
     hints: &Hints,
@@ -323,8 +328,9 @@ fn by_blocks(
     Ok((OpenedSource { source, volume: None }, opened.notes))
 }
 
-/// Returns the folder for what was found out about large volumes: `SLABCAST_CACHE`, or `slabcast` in the
-/// user's cache folder. `None` of a user without a home: it is found out each time.
+/// Returns the folder that keeps digests and block summaries of large volumes: `SLABCAST_CACHE`,
+/// else `CACHE_DIRECTORY` (set by systemd), else `slabcast` in the user's cache folder. `None` for
+/// a user without a home: then each run surveys the volume again.
 #[cfg(feature = "zarr")]
 fn cache_folder() -> Option<PathBuf> {
     let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
@@ -333,8 +339,8 @@ fn cache_folder() -> Option<PathBuf> {
     variable("SLABCAST_CACHE").or_else(|| variable("CACHE_DIRECTORY")).or_else(users)
 }
 
-/// This program as it parses DICOM for another of its processes (`slabcast read-dicom`). Where the
-/// system doesn't say which file we are, a thread has to do.
+/// Returns the command line of the child process that parses DICOM (`slabcast read-dicom`). `None`
+/// if the system does not tell the path of this program: then a thread parses.
 fn dicom_reader() -> Option<Vec<OsString>> {
     let program = std::env::current_exe().ok()?;
     Some(vec![program.into(), "read-dicom".into()])

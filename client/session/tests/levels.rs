@@ -1,4 +1,5 @@
-//! Levels of detail against closed forms: opacity, gradients and light are the same at each.
+//! Tests of coarser levels of detail against closed forms: opacity, gradients and light are the
+//! same at each level.
 
 use glam::DVec3;
 use slabcast_common::brick::Brick;
@@ -16,13 +17,14 @@ use slabcast_volumes::BrickStore;
 use slabcast_volumes::blocks::coarser;
 use std::sync::Arc;
 
-/// Edge of the volumes in samples of level 0: whole at levels 1 and 2.
+/// Edge of the volumes in samples of level 0; a multiple of 4, so that levels 1 and 2 halve it
+/// without a rest.
 const N: u32 = 32;
 /// Pixels a vox of level 0.
 const SCALE: u32 = 2;
 
-/// An unlit transfer function over values, with `colors` (value, linear RGB) and `opacities`
-/// (value, opacity in `unit`).
+/// Returns an unlit transfer function over values, with `colors` (value, linear RGB) and
+/// `opacities` (value, opacity in `unit`).
 fn transfer(
     colors: Vec<[f64; 4]>,
     opacities: Vec<[f64; 2]>,
@@ -41,7 +43,8 @@ fn transfer(
     }
 }
 
-/// Levels 0, 1 and 2 of `f(i, j, k)` as 16-bit codes, 0.5 world units a sample.
+/// Returns levels 0, 1 and 2 of the volume `f(i, j, k)`: 16-bit codes, 0.5 world units a sample at
+/// level 0.
 fn levels(f: impl Fn(u32, u32, u32) -> u16) -> Vec<Volume> {
     let all = (0..N.pow(3)).map(|n| f(n % N, n / N % N, n / N / N)).collect();
     let lattice = Lattice::from_spacing([N; 3], [0.5; 3]);
@@ -49,7 +52,7 @@ fn levels(f: impl Fn(u32, u32, u32) -> u16) -> Vec<Volume> {
     std::iter::successors(Some(volume), coarser).take(3).collect()
 }
 
-/// The picture of a level along z, two pixels a vox of level 0.
+/// Draws a level along z at two pixels a vox of level 0. Returns the linear RGBA of each pixel.
 fn draw(
     volume: &Volume,
     finest: &Lattice,
@@ -80,7 +83,8 @@ fn draw(
     serial::render(&frame, &bricks).pixels
 }
 
-/// Largest difference in 1/255 of each level's pixels within `from..to` of the edge from `want(x)`.
+/// Returns each level's largest difference from `want(x)`, in 1/255, over the pixels whose x and y
+/// lie within `from..to`.
 fn off(
     levels: &[Volume],
     tf: &TransferFunction,
@@ -94,7 +98,7 @@ fn off(
         let pixels = draw(volume, &levels[0].lattice, tf, quality);
         let inside = (from..to).flat_map(|y| (from..to).map(move |x| (x, y)));
         let difference = inside.map(|(x, y)| {
-            // In samples of level 0.
+            // Position of the pixel's centre in samples of level 0.
             let at = (f64::from(x) + 0.5) / f64::from(SCALE) - 0.5;
             let got = f64::from(pixels[(y * size + x) as usize][channel]);
             255.0 * (got - want(at)).abs()
@@ -126,7 +130,7 @@ fn constant_cube_has_the_same_opacity_at_each_level() {
         let tf = transfer(white(), steps(opacity), unit);
         let off_after = off(&cube, &tf, precise(Quality::default()), (16, 62), 3, |_| want);
         assert!(off_after.iter().all(|&off| off < 0.1), "{unit:?}: {off_after:?}");
-        // The Gaussian ripples by 0.6 %, and fades at the faces.
+        // The Gaussian ripples by 0.6 % and fades at the faces, so the bound is wider.
         let off_before = off(&cube, &tf, precise(Quality::before()), (24, 48), 3, |_| want);
         assert!(off_before.iter().all(|&off| off < 2.0), "{unit:?}: {off_before:?}");
     }
@@ -167,8 +171,8 @@ fn opacity_by_gradient_is_the_same_at_each_level() {
 
 #[test]
 fn light_is_the_same_at_each_level() {
-    // So flat that the normal is turned towards the eye by a part: 1/500 of the range over a vox.
-    // It rises towards the eye, so that its side is no matter of rounding.
+    // The gradient is 1/500 of the range over a vox: so flat that shading turns the normal part of
+    // the way towards the eye. It also rises towards the eye, so that rounding can't flip its side.
     let ramp = levels(|i, j, k| if [i, j, k] == [0; 3] { 16000 } else { (32 * i + 16 * k) as u16 });
     // The inner half alone is visible: gradients at the volume's faces are one-sided.
     let inner = vec![[0.0, 0.0], [624.0, 0.0], [656.0, 0.05], [848.0, 0.05], [880.0, 0.0]];

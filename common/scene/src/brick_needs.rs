@@ -32,8 +32,8 @@ pub struct BrickNeeds {
     /// Voxels within this many index steps of a visible one, along each axis, are stored too: what
     /// a kernel that reconstructs values near the visible ones takes in.
     pub halo: u32,
-    /// Whether bricks hold coefficients of an interpolating cubic B-spline, as 32-bit floats, in place of
-    /// values.
+    /// Whether bricks hold coefficients of an interpolating cubic B-spline, as 32-bit floats, in
+    /// place of values.
     pub coefficients: bool,
     /// Box outside of which no voxel is stored; `None` for the whole volume.
     pub crop: Option<CropBox>,
@@ -69,8 +69,8 @@ impl BrickNeeds {
         }
     }
 
-    /// Returns what the frames of a path see: its cropping box, and the union over its transfer
-    /// functions (those of `tween`, else `tf`).
+    /// Returns the brick needs of a path: its cropping box, and the union over the transfer
+    /// functions of its frames (from `tween` if there is one, else `tf`).
     ///
     /// # Errors
     /// If the box holds nothing.
@@ -111,8 +111,8 @@ impl BrickNeeds {
         self
     }
 
-    /// Returns the needs of a level of detail whose box has its centre at `centre`, a world vector from
-    /// that of level 0, to which cropping boxes are relative.
+    /// Returns the needs of a level of detail whose box has its centre at `centre`, a world vector
+    /// from that of level 0, to which cropping boxes are relative.
     #[must_use]
     pub fn at_centre(mut self, centre: DVec3) -> BrickNeeds {
         self.crop = self.crop.map(|crop| CropBox { lo: crop.lo - centre, hi: crop.hi - centre });

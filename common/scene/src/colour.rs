@@ -125,7 +125,7 @@ fn rgb_from_lab([l, a, b]: [f64; 3]) -> [f64; 3] {
     ];
     let rgb =
         linear.map(|c| if c > 0.0031308 { 1.055 * pow(c, 1.0 / 2.4) - 0.055 } else { 12.92 * c });
-    // What is too bright is darkened as a whole, so that the hue stays.
+    // A colour that is too bright is darkened as a whole, so that its hue stays.
     let largest = rgb.into_iter().fold(1.0, f64::max);
     rgb.map(|c| (c / largest).max(0.0))
 }

@@ -336,7 +336,7 @@ pub fn to_json(
             put(c[0], rgb);
             continue;
         };
-        // The same pieces as in reading, of which a line in sRGB numbers is near enough.
+        // Cut into the pieces that reading makes: in each, a line in sRGB numbers is near enough.
         let a = [before[1], before[2], before[3]];
         pieces(a, rgb, &mut |t, c_at| put(before[0] + (c[0] - before[0]) * t, c_at));
     }

@@ -35,7 +35,7 @@ pub struct PathRequest {
     pub transfer: TransferChoice,
     /// Quality of the pictures: all that changes pixels beside volume, views and colours.
     pub quality: Quality,
-    /// How the work is cut and scheduled.
+    /// Schedule and division of the work.
     pub work: Work,
     /// Format in which pixels leave the master.
     pub format: PixelFormat,

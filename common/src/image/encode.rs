@@ -41,7 +41,7 @@ impl PixelFormat {
     }
 }
 
-/// How finished pixels are encoded: format, and the background they are composited over.
+/// Encoding of finished pixels: their format, and the background they are composited over.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PixelEncoding {
     /// Number type and layout of an encoded pixel.
@@ -293,7 +293,7 @@ mod tests {
         let s = Srgb8::get();
         let even = (0..=100_000).map(|i| f64::from(i) / 100_000.0);
         let next = s.thresholds[..255].iter().flat_map(|t| [t.next_down(), *t, t.next_up()]);
-        // Where parts have their middle and where one ends.
+        // The middles and the ends of the table's parts.
         let halves = 2 * Srgb8::PARTS;
         let parts = (0..=halves).map(|i| i as f64 / halves as f64);
         for l in parts.clone().chain(even) {

@@ -90,7 +90,7 @@ fn sixteen_bits_are_for_scenes_that_they_round_little_of() {
         assert_eq!(sums(ramp(0.06), finer), Ok(Sums::I32), "{finer:?}");
     }
     assert_eq!(sums(ramp(0.9), Quality { eps: 1.0 / 32.0, ..q }), Ok(Sums::I16));
-    // What was asked for is kept.
+    // An explicit choice is kept.
     assert_eq!(sums(ramp(0.9), Quality { sums: Sums::I16, ..q }), Ok(Sums::I16));
     assert_eq!(sums(ramp(0.06), Quality { sums: Sums::I32, ..q }), Ok(Sums::I32));
 }
@@ -151,7 +151,7 @@ proptest! {
         let [a, b] = [tf.opacities[i], tf.opacities[i + 1]];
         tf.opacities.insert(i + 1, [on(a[0], b[0]), on(a[1], b[1])]);
         prop_assert_eq!(&want, &looks(&tf));
-        // The same point twice, and more of what holds outside anyway.
+        // A point twice, and points outside with the values that hold there anyway.
         tf.opacities.insert(i + 1, tf.opacities[i + 1]);
         tf.opacities.insert(0, [-3.0, tf.opacities[0][1]]);
         let [_, r, g, b] = tf.colors[tf.colors.len() - 1];
@@ -227,7 +227,7 @@ fn gradients_multiply_opacities() {
     let volume = Volume::from_fn_u8("v", [8, 1, 1], |i, _, _| (i * 30) as u8);
     let info = volume.info(Digest32::default());
     let mut tf = tf(vec![[0.0, 0.0], [200.0, 0.8]]);
-    // Of 210 values a vox: none at 0, half from 52.5 on.
+    // The range is 210 values: no opacity at a gradient of 0, half of it from 52.5 values a vox on.
     tf.gradient_opacity = vec![[0.0, 0.0], [52.5, 0.5]];
     tf.check().unwrap();
     let c = Classifier::new(&tf, &info, Compositing::Linear);

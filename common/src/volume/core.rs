@@ -26,9 +26,9 @@ const ROUNDS: usize = 40;
 /// apart from the lowest values.
 const ROOM: f64 = 0.1;
 
-/// Finds the core of samples whose range and histogram are `s`; `None` if there is no need of one.
-/// `count` counts the finite samples between two codes ([`bin`]); it is called for ends that hold next
-/// to nothing alone.
+/// Finds the core of samples with range and histogram `s`; `None` if the range will do. `count`
+/// counts the finite samples between two codes, in the bins of [`bin`]; it is called only if an end
+/// of the range holds next to nothing.
 pub(super) fn find<E>(
     s: &ValueSummary,
     mut count: impl FnMut(f64, f64) -> Result<Vec<u64>, E>,
@@ -84,15 +84,15 @@ fn trimmed(histogram: &[u64], negative: bool) -> (usize, usize) {
     (first, last)
 }
 
-/// Returns the bin, 0 to 255, of a finite code in a count between two codes; what lies beyond is in
-/// the first or the last.
+/// Returns the bin, 0 to 255, of a finite code among 256 equal bins from `lo` to `hi`. Codes below
+/// `lo` are in bin 0, codes above `hi` in bin 255.
 #[inline]
 pub(super) fn bin(code: f64, lo: f64, hi: f64) -> usize {
     let scale = 256.0 / (hi - lo);
     (((code - lo) * scale).max(0.0) as usize).min(255)
 }
 
-/// Counts the finite samples between two codes, in bins as [`bin`] gives them.
+/// Counts finite samples in the 256 bins of [`bin`].
 pub(super) fn counted(samples: &[f32], lo: f64, hi: f64) -> Vec<u64> {
     let mut histogram = vec![0; 256];
     for &code in samples.iter().filter(|c| c.is_finite()) {
@@ -119,7 +119,7 @@ mod tests {
         assert_eq!(core(body()), None);
         assert_eq!(core(vec![f32::NAN; 4]), None);
         assert_eq!(core(vec![7.0; 4]), None);
-        // Air of a CT, and what lies around its circle.
+        // Air of a CT, and the padding around its circle.
         let ct = body().into_iter().map(|v| v - 1000.0).chain(vec![-3024.0; 9000]).collect();
         assert_eq!(core(ct), None);
     }

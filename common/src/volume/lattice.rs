@@ -2,8 +2,9 @@
 
 use glam::{DMat3, DVec3};
 
-/// Lattice of a volume's samples. World units are the file's (mm), world axes anatomical (RAS+)
-/// where the file has them (docs/design/contracts.md, World and camera).
+/// Lattice of a volume's samples: their number, spacing and place. World units are the file's (mm);
+/// world axes are anatomical (RAS+) if the file has them (docs/design/contracts.md, World and
+/// camera).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lattice {
     /// Samples along the index axes i, j, k (i fastest).
@@ -55,13 +56,14 @@ impl Lattice {
         DMat3::from_cols(self.steps[0], self.steps[1], self.steps[2])
     }
 
-    /// Returns the matrix that [`Volume::gradient`](super::Volume::gradient) takes: the transposed inverse of
-    /// `world_from_index`, scaled to vox so that no unit overflows it.
+    /// Returns the matrix from index to world gradients, the argument of
+    /// [`Volume::gradient`](super::Volume::gradient): the transposed inverse of `world_from_index`,
+    /// scaled to vox so that no unit of length overflows it.
     ///
     /// Its numbers are rounded to f32. Gradients of integers are fractions of small numbers, and
     /// some lie just between two codes of a normal. In another unit of length the matrix has other
-    /// last bits, and one gradient in 10^4 or so would flip to the next code (a test of volumes counts
-    /// 44 in 5 10^5 without the rounding; two voxels make 1 % of a small picture differ).
+    /// last bits, and one gradient in 10^4 or so would flip to the next code (a test of volumes
+    /// counts 44 in 5 10^5 without the rounding; two voxels make 1 % of a small picture differ).
     pub fn gradient_matrix(&self) -> DMat3 {
         let vox = self.vox();
         let m = DMat3::from_cols(self.steps[0] / vox, self.steps[1] / vox, self.steps[2] / vox);
@@ -80,10 +82,10 @@ impl Lattice {
         self.origin + self.world_from_index() * self.centre_index()
     }
 
-    /// Returns the world vector from the centre of this lattice's box to that of `other`, which is
-    /// another level of the same volume.
+    /// Returns the world vector from the centre of this lattice's box to the centre of the box of
+    /// `other`, another level of the same volume.
     ///
-    /// Rounded to 1/65536 of a step, so that a far origin leaves no noise in it.
+    /// It is rounded to 1/65536 of a step, so that a far origin leaves no noise in it.
     pub fn to_centre_of(&self, other: &Lattice) -> DVec3 {
         let between = (other.origin - self.origin)
             + (other.world_from_index() * other.centre_index()
@@ -92,14 +94,15 @@ impl Lattice {
         self.world_from_index() * ((steps * 65536.0).round() / 65536.0)
     }
 
-    /// Returns the largest extent in world units (N samples count as N spacings).
+    /// Returns the largest extent of the box along an index axis, in world units. N samples count
+    /// as N spacings.
     pub fn largest_extent(&self) -> f64 {
         let s = self.spacing();
         (0..3).map(|a| s[a] * self.dims[a] as f64).fold(0.0, f64::max)
     }
 
-    /// Returns the longest way through the volume, from corner to corner, in world units (N samples
-    /// count as N spacings).
+    /// Returns the length of the longest diagonal of the volume's box, in world units. N samples
+    /// count as N spacings.
     pub fn diagonal(&self) -> f64 {
         let [a, b, c] = [0, 1, 2].map(|i| self.steps[i] * f64::from(self.dims[i]));
         [a + b + c, a + b - c, a - b + c, -a + b + c]
@@ -152,7 +155,7 @@ impl Lattice {
     }
 }
 
-/// Why a lattice can't be drawn.
+/// Reason for which a lattice can't be drawn.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum LatticeError {
     /// An axis has no sample. Holds the dimensions.
@@ -170,7 +173,7 @@ pub enum LatticeError {
     /// Two index axes coincide.
     #[error("two index axes point the same way; the volume would be flat")]
     Flat,
-    /// Spacings differ too much. Holds the largest over the smallest.
+    /// Spacings differ too much. Holds the ratio of the largest to the smallest.
     #[error("spacings differ by a factor of {0:.3e}; at most 1e6")]
     UnequalSpacings(f64),
 }

@@ -1,9 +1,10 @@
-//! Colours of voxels that have their own: a palette, of which each voxel holds a place.
+//! Palette of a volume whose voxels have colours of their own. Each voxel holds a place in it.
 //!
-//! The engine classifies voxels by a table of at most 65,536 looks. A volume of colours is drawn by
-//! the same table: a voxel's code is the place of its colour in a palette (docs/design/model.md,
-//! Colours of voxels). Whatever takes values as numbers (opacity, histogram, gradient) takes the
-//! palette's *values*: alpha where voxels have one that differs, else luminance.
+//! The engine classifies voxels by a table of at most 65,536 optical samples. A volume of colours
+//! is drawn by the same table: a voxel's code is the place of its colour in the palette
+//! (docs/design/model.md, Colours of voxels). Opacity, histogram and gradient need a number instead
+//! of a colour. They take the *value* of the colour: alpha if the voxels' alphas differ, else
+//! luminance.
 
 use super::Digest32;
 use sha2::{Digest, Sha256};
@@ -39,8 +40,8 @@ impl ColourValue {
     }
 }
 
-/// Returns the luminance of a colour in sRGB, 0 to 255: 0.30 red + 0.59 green + 0.11 blue, rounded.
-/// VTK and ITK have these shares.
+/// Returns the luminance of a colour in sRGB, 0 to 255: 0.30 red + 0.59 green + 0.11 blue, rounded,
+/// as in VTK and ITK.
 #[inline]
 pub fn luminance([r, g, b]: [u8; 3]) -> u8 {
     ((30 * u32::from(r) + 59 * u32::from(g) + 11 * u32::from(b) + 50) / 100) as u8
@@ -48,8 +49,8 @@ pub fn luminance([r, g, b]: [u8; 3]) -> u8 {
 
 /// Colours of a volume's voxels, by code.
 ///
-/// Colours ascend by value, then by red, green, blue and alpha. So one set of colours is one palette,
-/// and the colours between two values lie side by side.
+/// Colours ascend by value, then by red, green, blue and alpha. So each set of colours has one
+/// palette, and the colours between two values lie side by side.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Palette {
     colours: Vec<[u8; 4]>,
@@ -57,10 +58,10 @@ pub struct Palette {
     value: ColourValue,
 }
 
-/// Why colours are no palette.
+/// Reason for which colours are not a palette.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PaletteError {
-    /// There are none, or too many. Holds their number.
+    /// There is no colour, or there are too many. Holds their number.
     #[error("has {0} colours; give 1 to 65536")]
     Number(usize),
     /// The bytes are not four a colour. Holds their number.
@@ -71,7 +72,7 @@ pub enum PaletteError {
         "colour {0} is not above the one before; sort them by value, red, green, blue and alpha"
     )]
     Order(usize),
-    /// Alphas, or values that are alphas, of voxels that have none.
+    /// The colours have alphas, or alphas are the values, though the voxels have no alpha.
     #[error("has alphas, of voxels that are said to have none")]
     Alpha,
     /// A voxel's code is beyond the palette. Holds the code.
@@ -80,12 +81,12 @@ pub enum PaletteError {
 }
 
 impl Palette {
-    /// Returns the palette of `colours` (red, green, blue in sRGB, alpha). Without alpha all alphas are
-    /// 255.
+    /// Returns the palette of `colours` (red, green, blue in sRGB, alpha), which must ascend. If
+    /// `has_alpha` is false, all alphas must be 255.
     ///
     /// # Errors
-    /// There are none or more than [`COLOURS_MAX`], they do not ascend, or they have alphas that they
-    /// should not.
+    /// There is no colour, there are more than [`COLOURS_MAX`], they do not ascend, or they have
+    /// alphas though `has_alpha` is false.
     pub fn new(
         colours: Vec<[u8; 4]>,
         has_alpha: bool,
@@ -105,10 +106,11 @@ impl Palette {
         Ok(Palette { colours, has_alpha, value })
     }
 
-    /// Returns the palette of colours in any order, of which some may be there twice.
+    /// Returns the palette of `colours` in any order; repeated colours count once.
     ///
     /// # Errors
-    /// As [`Palette::new`].
+    /// There is no colour, there are more than [`COLOURS_MAX`], or they have alphas though
+    /// `has_alpha` is false.
     pub fn sorted(
         mut colours: Vec<[u8; 4]>,
         has_alpha: bool,
@@ -119,16 +121,16 @@ impl Palette {
         Palette::new(colours, has_alpha, value)
     }
 
-    /// Returns the palette of [`Palette::to_bytes`].
+    /// Parses the bytes of a palette as [`Palette::to_bytes`] writes them: four a colour.
     ///
     /// # Errors
-    /// The bytes are not four a colour, or as [`Palette::new`].
+    /// The bytes are not four a colour, or the colours are refused by [`Palette::new`].
     pub fn from_bytes(
         bytes: &[u8],
         has_alpha: bool,
         value: ColourValue,
     ) -> Result<Palette, PaletteError> {
-        // Seen before memory is taken.
+        // Checked before memory is allocated.
         if !bytes.len().is_multiple_of(4) {
             return Err(PaletteError::Bytes(bytes.len()));
         }
@@ -154,12 +156,12 @@ impl Palette {
         self.has_alpha
     }
 
-    /// Returns the number that is a colour's value.
+    /// Returns which number of a colour is its value: luminance or alpha.
     pub fn value(&self) -> ColourValue {
         self.value
     }
 
-    /// Returns the numbers of a voxel in the file: 3 or 4.
+    /// Returns the count of numbers that a voxel has in the file: 3, or 4 with alpha.
     pub fn channels(&self) -> usize {
         3 + usize::from(self.has_alpha)
     }
@@ -187,7 +189,7 @@ impl Palette {
             .collect()
     }
 
-    /// Returns a digest of the palette.
+    /// Returns the SHA-256 over the palette's colours and the choice of their values.
     pub fn digest(&self) -> Digest32 {
         let mut h = Sha256::new();
         h.update(b"slabcast palette 1");

@@ -1,4 +1,5 @@
-//! How far a worker comes through a recorded region, and where it stalls for want of bricks.
+//! Replays a worker's progress through a recorded region: the sheets it reaches, and where it
+//! stalls for lack of bricks.
 //!
 //! A worker draws the parts of a tile one after another. Each part stops before the first sheet
 //! that lacks a brick; the worker then sets the tile aside until the bricks it asked for have come

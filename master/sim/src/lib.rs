@@ -1,6 +1,6 @@
 //! A virtual cluster: the scheduler itself, against virtual workers and links on a virtual clock.
 //!
-//! How long will a frame take on 40 machines? Is the picture whole when three of them die? A
+//! Will a frame take 10 ms on 40 machines, or 100? Is the picture whole when three of them die? A
 //! formula knows tiles and bandwidth; it knows nothing of the order in which leases are given, of
 //! barriers, of what is lent ahead, or of which copy of a late tile counts. All of that is decided
 //! by [`Scheduler`](slabcast_schedule::Scheduler), which is pure: so it decides here too, and only

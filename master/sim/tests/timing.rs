@@ -405,7 +405,7 @@ fn regions_have_no_barrier_and_get_the_bricks_they_ask_for() {
     // Several frames in the making leave nobody waiting at the end of one.
     let (slab, trace) = world(40);
     let mut region = under(Schedule::Region, &slab);
-    // Of one size: here a tile takes as long as it is large, whatever lies in it.
+    // All tiles have one size: here a tile's time is its area, whatever lies in it.
     region.iter_mut().for_each(|job| job.work.tile = Some(32));
     let ms = |in_flight| {
         let c = Cluster { frames_in_flight: in_flight, ..cluster(8) };

@@ -13,8 +13,8 @@
 //! past it; one that has waited for [`HOLDS_BACK`] lets no other frame begin before it.
 //!
 //! Frames may take minutes, and no address is to wait for another's. So each may have one frame in
-//! flight whatever others have ([`Driver::may_fly`]), and where the budget of flights is full or held
-//! back, that one frame begins in a reserve beside it, a quarter as large.
+//! flight whatever others have ([`Driver::may_fly`]), and where the budget of flights is full or
+//! held back, that one frame begins in a reserve beside it, a quarter as large.
 
 use super::{Driver, Event, Flight};
 use crate::hooks::Stage;
@@ -35,9 +35,9 @@ use tracing::{info, warn};
 /// all others. A frame of 1024x1024 takes 0.1 s.
 const HOLDS_BACK: Micros = 1_000_000;
 
-/// The reserve is the budget of flights divided by this. With a sixteenth, a master of 2 GiB could not
-/// take a frame of 2048x2048. It comes on top of the memory that the master may hold, so it
-/// is no larger.
+/// The reserve is the budget of flights divided by this. With a sixteenth, a master of 2 GiB could
+/// not take a frame of 2048x2048. It comes on top of the memory that the master may hold, so it is
+/// no larger.
 const RESERVE_DIVISOR: u64 = 4;
 
 /// Microseconds after which the driver looks again while something waits for memory that time alone
@@ -70,8 +70,8 @@ struct Places {
 
 impl Room {
     /// Returns the budgets that have room for a frame of `making` bytes while it is rendered and
-    /// `finished` bytes afterwards. `wanted`: a watcher waits for the frame. `is_only`: its address has
-    /// no other frame in flight.
+    /// `finished` bytes afterwards. `wanted`: a watcher waits for the frame. `is_only`: its address
+    /// has no other frame in flight.
     fn places(
         &self,
         shares: &Shares,
@@ -163,8 +163,9 @@ impl Driver {
         self.active.ids().any(|id| self.active.client_of(id) != client && is_open(&id))
     }
 
-    /// Takes back frames of the `slab` schedule while another address has a job: no other frame can be
-    /// drawn beside them. They are drawn again by `region` ([`Driver::begin`]), to the same pixels.
+    /// Takes back frames of the `slab` schedule while another address has a job: no other frame can
+    /// be drawn beside them. They are drawn again by `region` ([`Driver::begin`]), to the same
+    /// pixels.
     fn make_way(&mut self) {
         let is_in_the_way = |f: &Flight| f.is_slab && self.others_are_open(f.client);
         let flights = self.flights.iter().filter(|(_, f)| is_in_the_way(f));
@@ -177,9 +178,10 @@ impl Driver {
         }
     }
 
-    /// Whether a frame may begin beside those in flight, so that no address keeps others waiting. An
-    /// address without a frame in flight may begin one while fewer than [`MOST_FRAMES_IN_FLIGHT`] fly.
-    /// Another needs fewer than [`FRAMES_IN_FLIGHT`], and all its frames must have one brick set.
+    /// Whether a frame may begin beside those in flight, so that no address keeps others waiting.
+    /// An address without a frame in flight may begin one while fewer than
+    /// [`MOST_FRAMES_IN_FLIGHT`] fly. Another needs fewer than [`FRAMES_IN_FLIGHT`], and all its
+    /// frames must have one brick set.
     fn may_fly(&self, candidate: &Candidate) -> bool {
         let Some(job) = self.active.get(candidate.job) else { return false };
         let client = self.active.client_of(candidate.job);
@@ -439,7 +441,7 @@ mod tests {
         let used = Room { reserved: 20, ..full };
         assert_eq!(places(&used, true, true, 5), (false, true));
         assert_eq!(places(&used, true, true, 6), (false, false), "others use it");
-        // What is in the reserve holds up no frame that is larger than the budget.
+        // Bytes in the reserve don't hold up a frame that is larger than the budget.
         let alone = Room { reserved: 20, ..Room::default() };
         assert_eq!(places(&alone, true, true, 1 << 40), (true, false));
     }

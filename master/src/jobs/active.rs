@@ -30,7 +30,7 @@ pub(crate) struct ActiveJob {
     pub(crate) views: Views,
     /// The next frame that was never rendered, or one before it.
     pub(crate) next: u64,
-    /// How many frames of it were begun, those that were rendered again included.
+    /// Number of frames that were begun, repeated ones included.
     pub(crate) begun: u64,
 }
 
@@ -87,8 +87,8 @@ struct Peer {
     work_us: u64,
 }
 
-/// Returns the guessed thread time of a frame in flight, in microseconds: 1 ms, and 1 us for each KiB
-/// of memory that it takes while it is rendered.
+/// Returns the guessed thread time of a frame in flight, in microseconds: 1 ms, and 1 us for each
+/// KiB of memory that it takes while it is rendered.
 fn guessed_us(making_bytes: u64) -> u64 {
     1000 + making_bytes / 1024
 }
@@ -138,8 +138,8 @@ impl ActiveJobs {
         }
     }
 
-    /// Records that a frame ended, failed or was cancelled: replaces the guess for `making_bytes` by
-    /// its thread time `took_us`, in microseconds.
+    /// Records that a frame ended, failed or was cancelled: replaces the guess for `making_bytes`
+    /// by its thread time `took_us`, in microseconds.
     pub(crate) fn ended(&mut self, id: JobId, making_bytes: u64, took_us: u64) {
         let peer = self.peer_of.get(&id).and_then(|peer| self.peers.get_mut(peer));
         if let Some(peer) = peer {
@@ -164,8 +164,8 @@ impl ActiveJobs {
         self.by_id.iter().any(|(id, job)| job.scene.bricks == bricks && is_open(id))
     }
 
-    /// The frame that each job would begin next: one that a watcher waits for, or else the next that
-    /// was never rendered. Jobs of the address that took least time come first, and among its
+    /// The frame that each job would begin next: one that a watcher waits for, or else the next
+    /// that was never rendered. Jobs of the address that took least time come first, and among its
     /// jobs those in earlier turns. Within a turn, frames that are waited for come first, and older
     /// jobs. `is_in_flight` tells of frames that are being rendered.
     pub(crate) fn candidates(

@@ -1,7 +1,8 @@
 //! A set of frame numbers.
 //!
-//! A job of 100,000 frames has an entry for each frame that was ever finished. A bit each is 12 KiB;
-//! a tree of numbers takes two megabytes, a thousand times over for the jobs that are remembered.
+//! A job of 100,000 frames has an entry for each frame that was ever finished. A bit each is 12
+//! KiB; a tree of numbers takes two megabytes, a thousand times over for the jobs that are
+//! remembered.
 
 /// See the head of the file.
 #[derive(Clone, Debug, Default)]
@@ -36,7 +37,7 @@ impl Numbers {
         self.words.get(n as usize / 64).is_some_and(|word| word & (1 << (n % 64)) != 0)
     }
 
-    /// How many numbers are in the set.
+    /// Returns the number of numbers in the set.
     pub(crate) fn len(&self) -> u64 {
         self.len
     }

@@ -382,7 +382,7 @@ fn one_address_has_half_of_the_memory_for_requests() {
     let _others = jobs.reserve(8 << 20, other, 99).expect("half is left for others");
     assert!(matches!(jobs.reserve(1 << 20, other, 99), Err(SubmitError::Full(_))), "64 MiB");
     drop(held);
-    // What is decided last is what the checked request takes.
+    // The last check counts the bytes of the request itself.
     let mut table = jobs.lock();
     let mut big = job(JobId(1), 1);
     (big.peer, big.held_bytes) = (greedy, 32 << 20);

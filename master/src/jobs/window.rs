@@ -1,9 +1,10 @@
-//! What of a volume that does not fit into memory a job needs: blocks in view with visible values.
+//! Restricts a job on a large volume to the blocks that its frames show.
 //!
-//! A set that fits the master's budget is cut whole, so that all jobs share it. Of a larger one only the
-//! blocks that some frame shows are cut. Contents beyond the budget are read again when a worker asks
-//! for them; the directory of bricks stays in memory at the master and at each worker, and a job whose
-//! directory would not fit is refused before anything is read.
+//! A brick set that fits the master's budget is cut whole, so that all jobs share it. A larger set
+//! is cut only at the blocks that some frame of the job shows. Bricks beyond the budget are
+//! dropped, and read again when a worker asks for them. The directory of bricks stays in memory at
+//! the master and at each worker; a job whose directory would not fit is refused before anything is
+//! read.
 
 use super::submit::SubmitError;
 use crate::library::{OpenVolume, VolumeError};
@@ -18,7 +19,7 @@ use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_volumes::store::{Estimate, estimate};
 use std::sync::Arc;
 
-/// Returns the blocks of a set of which a voxel may lie in a cropping box.
+/// Returns the blocks of a set that may have a voxel in a cropping box.
 fn within(blocks: &BlockSet, crop: &CropBox, lattice: &Lattice) -> BlockSet {
     let mut inside = BlockSet::new(lattice.dims);
     let [nx, ny, nz] = block_dims(lattice.dims).map(|n| n as usize);
@@ -41,15 +42,16 @@ fn within(blocks: &BlockSet, crop: &CropBox, lattice: &Lattice) -> BlockSet {
     inside
 }
 
-/// Bytes of memory that a brick takes beside its contents, at the master and at each worker: its entry
-/// in the directory, its places in the tables of workers, and what is known of its use.
+/// Bytes of memory that a brick takes beside its contents, at the master and at each worker: its
+/// entry in the directory, its places in the tables of workers, and the record of its use.
 const DIRECTORY_BYTES: u64 = 160;
 
-/// Returns the needs of a job, restricted to what its frames show if the whole set does not fit.
-/// `views` calls its argument with each view of the path.
+/// Returns the needs of a job, restricted to the blocks that its frames show if the whole brick set
+/// does not fit the master's budget. `views` calls its argument with each view of the path.
 ///
 /// # Errors
-/// Not even that fits, or a file can't be read.
+/// Even the directory of the restricted set does not fit; the kernel interpolates, which needs all
+/// samples in memory; a view is invalid; or a file can't be read.
 pub(super) fn fit(
     needs: BrickNeeds,
     open: &OpenVolume,

@@ -1,8 +1,8 @@
 //! Levels of detail of volumes in memory, computed when a job needs them.
 //!
-//! A level is a volume with a digest of its own. Its description is remembered, so that a job finds
-//! by digest what it is of; its samples stay while memory lasts, like those of files, and are
-//! computed again when they are needed. One is computed at a time, by all cores.
+//! A level is a volume with a digest of its own. The library remembers its description, so that a
+//! job finds its volume by the digest. Its samples stay while memory lasts, as samples of files do,
+//! and are computed again when they are needed. One level is computed at a time, by all cores.
 
 use super::{
     Entries, Library, OpenVolume, ServedVolume, Viewer, VolumeError, no_such_digest, sample_bytes,
@@ -29,9 +29,9 @@ fn lattices(lattice: &Lattice) -> impl Iterator<Item = Lattice> {
 }
 
 impl Library {
-    /// Returns a level of a volume; of a volume with fewer levels the coarsest (colours have one), and
-    /// of one that is itself a coarser level its own. A file's own levels are taken as they are; others are computed
-    /// from a volume in memory.
+    /// Returns a level of a volume, or the coarsest if it has fewer levels (colours have one). A
+    /// volume that is itself a coarser level gives that level. Levels of a file are taken from it;
+    /// others are computed from the volume in memory.
     ///
     /// # Errors
     /// There is no memory for it.
@@ -99,8 +99,8 @@ impl Library {
         if open.served.info.digest == digest { Ok(open) } else { Err(no_such_digest(digest)) }
     }
 
-    /// Drops samples of others until there is memory for a level. What is halved on the way counts: at
-    /// most a third more than the first halving.
+    /// Drops samples of others until there is memory for a level. What is halved on the way counts:
+    /// at most a third more than the first halving.
     fn make_room(&self, open: &OpenVolume, lattice: &Lattice) -> Result<(), VolumeError> {
         let per_sample = open.served.info.summary.kind.bytes() as u64;
         let steps = lattices(&open.served.info.lattice).skip(1);
@@ -152,7 +152,8 @@ impl Entries {
         self.levels.insert(open.served.info.digest, level);
     }
 
-    /// Returns of which volume a digest is a level, and which level.
+    /// Returns the volume and the number of the level with this digest; `None` if it is not a
+    /// level.
     fn level_of(&self, digest: Digest32) -> Option<(Digest32, u32)> {
         if let Some(level) = self.levels.get(&digest) {
             return Some((level.of, level.served.info.level));
@@ -167,7 +168,8 @@ impl Entries {
         held.map(|level| sample_bytes(&level.served.info)).sum()
     }
 
-    /// When the level that was unused for longest was used; `None` if none is in memory.
+    /// Returns the least recently used level, with the time of its last use; `None` if no level is
+    /// in memory.
     pub(super) fn oldest_level(&self) -> Option<(u64, Digest32)> {
         let held = self.levels.iter().filter(|(_, level)| level.source.is_some());
         held.map(|(digest, level)| (level.used, *digest)).min()

@@ -1,14 +1,13 @@
 //! The volumes of a master, by name and digest.
 //!
 //! A volume comes from one of three places: the master was started with it, it is a file of the
-//! folder of volumes, or a client put it there (`uploads`). Files are read when a request needs
-//! them. Their samples stay while memory lasts: the volume that was unused for longest goes first and
-//! is read again when it is needed. So jobs keep digests, and whoever needs samples asks for them
-//! here, by digest.
+//! folder of volumes, or a client uploaded it (`uploads`). Files are read when a request needs
+//! them. Their samples stay while memory lasts. The least recently used volume is dropped first,
+//! and read again when it is needed. So jobs keep digests, and ask for samples here, by digest.
 //!
-//! One file is read at a time, so that what is read never takes more than the memory for volumes.
-//! Every function here may read a file or wait for one: callers run on threads of their own, never on
-//! the driver's or the runtime's.
+//! One file is read at a time, so that reading never takes more than the memory for volumes. Every
+//! function here may read a file or wait for one: call it on a blocking thread, never on the
+//! driver's or the runtime's.
 
 mod levels;
 mod stored;
@@ -92,7 +91,8 @@ pub struct Unreadable {
 /// A volume that was opened, in memory or as a file, and its axes.
 pub type Source = (Arc<dyn BlockSource>, Orientation);
 
-/// Opens a file or folder as a volume that takes at most so many bytes of memory, and finds its axes.
+/// Opens a file or folder as a volume that takes at most so many bytes of memory, and finds its
+/// axes.
 pub type ReadFile = Arc<dyn Fn(&Path, u64) -> Result<Source, Unreadable> + Send + Sync>;
 
 /// Settings of a [`Library`].
@@ -115,7 +115,7 @@ pub enum VolumeError {
     /// The master has several volumes, and the request names none.
     #[error("volume: {0}")]
     Choose(String),
-    /// There is none of that name or digest.
+    /// There is no volume of that name or digest.
     #[error("{0}")]
     NotFound(String),
     /// Its file can't be read.
@@ -138,7 +138,7 @@ pub enum VolumeError {
     Damaged(String),
 }
 
-/// Caller of the library. Decides which names it is told.
+/// Caller of the library, which decides the names that it may see.
 #[derive(Clone, Copy, Debug)]
 pub struct Viewer {
     /// Address of the caller; `None`: this process.
@@ -607,11 +607,11 @@ impl Library {
         self.uploads.as_ref().ok_or_else(|| VolumeError::Refused(refused.into()))
     }
 
-    /// Removes an uploaded volume. `is_used` says whether a job in progress draws the volume with this
-    /// digest.
+    /// Removes an uploaded volume. `is_used` says whether a job in progress draws the volume with
+    /// this digest.
     ///
     /// # Errors
-    /// There is no such volume, or it is none to remove.
+    /// There is no such volume, or it was not uploaded, or a job draws it.
     pub fn remove(
         &self,
         name: &str,
@@ -649,7 +649,7 @@ impl Entries {
         self.by_name.values().find(|e| e.digest() == Some(digest))?.served.clone()
     }
 
-    /// Name of the volume that is meant where none is named.
+    /// Returns the name of the volume for requests that name none.
     fn default_name(&self) -> Result<String, VolumeError> {
         let mut given = self.by_name.iter().filter(|(_, e)| e.origin == VolumeOrigin::Given);
         if let Some((name, _)) = given.next() {
@@ -771,7 +771,7 @@ fn list_files(folder: &Path) -> std::io::Result<BTreeMap<String, Stamp>> {
         if name.starts_with('.') || name.chars().any(char::is_control) {
             continue;
         }
-        // Of what a link points to.
+        // Follows links.
         let Ok(about) = std::fs::metadata(found.path()) else { continue };
         let lower = name.to_ascii_lowercase();
         let is_volume = about.is_dir() || endings().any(|e| lower.ends_with(e));

@@ -1,7 +1,7 @@
 //! The file of an uploaded volume: its header as `VolumeHeader` of `render.proto`, and its samples.
 //!
-//! Clients read files, in whatever format and with whatever flags, and send samples. So a master
-//! parses no files of strangers, and the digest stays what it was at the client.
+//! Clients read files, in any format and with any flags, and send samples. So a master never parses
+//! files of strangers, and a volume has the digest that it had at the client.
 //!
 //! | bytes | |
 //! |---|---|

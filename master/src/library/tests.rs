@@ -4,7 +4,7 @@ use super::*;
 use slabcast_common::volume::{Samples, Volume};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-/// A volume of 8 x 8 x 8 bytes; `seed` makes it another.
+/// Returns a volume of 8 x 8 x 8 bytes; `seed` makes it another.
 fn volume(seed: u32) -> Volume {
     Volume::from_fn_u8("v", [8; 3], move |i, j, k| (i * 3 + j * 5 + k * 7 + seed) as u8)
 }
@@ -34,7 +34,7 @@ struct World {
 }
 
 impl World {
-    /// A library of the files `a.nrrd`, `b.nrrd` and so on, with memory for `fits` of them.
+    /// Returns a library of the files `a.nrrd`, `b.nrrd` and so on, with memory for `fits` of them.
     fn new(files: &[&str], fits: u64) -> World {
         let dir = tempfile::tempdir().expect("a folder");
         let folder = dir.path().join("volumes");

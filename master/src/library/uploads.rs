@@ -1,9 +1,9 @@
 //! Volumes that clients put on a master: pieces in, a file out.
 //!
 //! Samples go to a file with a temporary name as they come, and through the hash that names the
-//! volume. The file gets its name when all samples are there, their digest is the announced one, and
-//! they are on disk. Chunks come in order, may come twice, and are answered with what is there, so a
-//! client whose connection broke goes on where it was.
+//! volume. The file gets its name when all samples are there, their digest is the announced one,
+//! and they are on disk. Chunks come in order, may come twice, and are answered with what is there,
+//! so a client whose connection broke goes on where it was.
 
 use super::stored::{self, Stored};
 use super::{VolumeError, sample_bytes, short_name};
@@ -136,7 +136,8 @@ impl Uploads {
         found.collect()
     }
 
-    /// Begins an upload, or finds how far it is. `held_bytes`: of the files that are there.
+    /// Begins an upload, or finds how far an earlier one came. `held_bytes` is the size of the
+    /// files that are there.
     ///
     /// # Errors
     /// There is no place for it.
@@ -195,11 +196,12 @@ impl Uploads {
         Ok(Progress { received_bytes: 0, done: false })
     }
 
-    /// Adds a piece. Returns how far the upload is, and the volume with its uploader if it is whole.
+    /// Adds a piece to an upload. Returns the bytes received so far, and the volume with its
+    /// uploader once it is complete.
     ///
     /// # Errors
-    /// There is no such upload; the disk is full; or the samples have another digest. Of an upload that
-    /// fails nothing stays.
+    /// There is no such upload; the disk is full; or the samples have another digest. A failed
+    /// upload is removed.
     pub(super) fn add(
         &self,
         digest: Digest32,
@@ -218,7 +220,7 @@ impl Uploads {
             let why = format!("chunk: ends at byte {end}, and there are {}", part.total);
             return Err(VolumeError::Choose(why));
         }
-        // What is there already, or comes too early, is not written.
+        // Bytes that are there already, or that leave a gap, are not written.
         if offset <= part.received && end > part.received {
             let new = &data[(part.received - offset) as usize..];
             if let Err(e) = part.file.write_all(new) {

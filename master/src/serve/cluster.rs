@@ -325,7 +325,7 @@ async fn control(
                 }
             }
         }
-        // What was said last still leaves.
+        // The last messages are still sent.
         drop(messages);
         std::future::pending::<()>().await;
     };
@@ -387,6 +387,7 @@ async fn control(
 
 /// Whether a stream broke because bytes were changed on their way: no tile is to blame for that.
 fn is_damage(status: &Status) -> bool {
-    // Decoding and HTTP/2 fail with INTERNAL on this side; a peer that dies ends a stream otherwise.
+    // Decoding and HTTP/2 fail with INTERNAL on this side; a peer that dies ends a stream
+    // otherwise.
     matches!(status.code(), Code::DataLoss | Code::Internal)
 }

@@ -80,7 +80,7 @@ where
         let is_ours = path.starts_with("/slabcast.");
         let is_worker = path.starts_with("/slabcast.cluster.");
         if let Some(peer) = &peer {
-            // Where tonic's requests look for the address.
+            // tonic's requests read the peer's address from this extension.
             request.extensions_mut().insert(peer.tcp.clone());
         }
         let ip = peer.as_ref().and_then(|peer| peer.ip());

@@ -1,4 +1,5 @@
-//! Caps of jobs, watchers and connections by client address, and log lines of clients that reach them.
+//! Caps of jobs, watchers and connections by client address, and log lines of clients that reach
+//! them.
 //!
 //! Until jobs have owners an address is all that is known of a client. So one address may have a
 //! share of each thing that runs out, and the others find the rest free. Clients behind one address
@@ -53,7 +54,7 @@ pub(crate) fn counted_as(ip: IpAddr) -> IpAddr {
     }
 }
 
-/// How much of something each address has.
+/// Counts of some resource by address.
 #[derive(Default)]
 pub(super) struct Counts(Mutex<BTreeMap<IpAddr, usize>>);
 

@@ -1,15 +1,16 @@
 //! Volumes of colours: voxels of three or four numbers that are red, green, blue and alpha.
 //!
-//! Readers know volumes of one number a voxel, and take one of several with `--channel`. So a file of
-//! colours is refused by its reader, and the refusal says that the numbers are colours
-//! ([`Problem::colours`]). It is then read once for each of them, and a palette is made of the numbers:
-//! up to 65,536 colours are kept as they are. Of more, each channel loses bits, one channel after the
-//! other, until they are few enough; a colour is then the mean of those that became one. This is even
-//! over the cube of colours and needs no order of voxels, so the same file has the same palette
-//! everywhere. Clustering (median cut) would round the common colours less, by a level or two.
+//! Readers know volumes of one number a voxel, and take one of several with `--channel`. So a file
+//! of colours is refused by its reader, and the refusal says that the numbers are colours
+//! ([`Problem::colours`]). It is then read once for each of them, and a palette is made of the
+//! numbers: up to 65,536 colours are kept as they are. Of more, each channel loses bits, one
+//! channel after the other, until they are few enough; a colour is then the mean of those that
+//! became one. This is even over the cube of colours and needs no order of voxels, so the same file
+//! has the same palette everywhere. Clustering (median cut) would round the common colours less, by
+//! a level or two.
 //!
-//! Reading a compressed file three times takes three times as long. That was chosen over a second kind
-//! of samples in every reader.
+//! Reading a compressed file three times takes three times as long. That was chosen over a second
+//! kind of samples in every reader.
 
 use crate::error::{OpenErrorKind, Problem};
 use crate::numbers::{Beside, Pieces};
@@ -123,7 +124,7 @@ fn to_bytes(planes: &[Samples]) -> Result<(Vec<Vec<u8>>, Option<String>), Proble
     Ok((all, note))
 }
 
-/// Returns the numbers of all channels, those of a voxel beside each other.
+/// Interleaves the numbers of all channels, so that the numbers of a voxel lie beside each other.
 fn interleaved(planes: &[Samples]) -> Result<Pieces, Problem> {
     macro_rules! all {
         ($kind:ident) => {{
@@ -209,7 +210,8 @@ impl Made {
         Ok(Made { palette, places, rounded, even_alpha })
     }
 
-    /// Returns what was decided, one sentence each. `kept` says that the file's own numbers are kept.
+    /// Returns what was decided, one sentence each. `kept` says that the file's own numbers are
+    /// kept.
     fn notes(&self, kept: bool) -> Vec<String> {
         let mut notes = Vec::new();
         if self.rounded > 0 && !kept {
@@ -227,8 +229,8 @@ impl Made {
     }
 }
 
-/// Cells of colours, numbered in the order in which voxels come: a table of open addresses, since it is
-/// asked for every voxel.
+/// Cells of colours, numbered in the order in which voxels come: a table of open addresses, since
+/// it is asked for every voxel.
 struct Cells {
     /// Key and number of each cell; numbers above [`COLOURS_MAX`] are free places.
     slots: Vec<(u32, u32)>,
@@ -295,8 +297,8 @@ impl Cells {
     }
 }
 
-/// Returns whether the numbers of a voxel, all of one type, are colours unless the file says that they are
-/// not: three or four of 8 or 16 bits without sign.
+/// Returns whether the numbers of a voxel, all of one type, are colours unless the file says that
+/// they are not: three or four of 8 or 16 bits without sign.
 pub(crate) fn may_be_colours(count: u64, number: Number) -> bool {
     matches!(count, 3..=4) && matches!(number, Number::U8 | Number::U16)
 }

@@ -19,7 +19,7 @@ const HEADER_MAX_BYTES: u64 = 1 << 20;
 /// Iterates over the lines of a header.
 pub(crate) struct HeaderLines<'a> {
     source: &'a mut Source,
-    /// How to end a header, for error messages.
+    /// Remedy for a header without an end, for error messages.
     remedy: &'static str,
     /// Lines read so far.
     number: usize,
@@ -69,7 +69,7 @@ pub(crate) enum Skip {
     FromEnd,
 }
 
-/// How the samples are stored in a file.
+/// Storage of the samples in a file: encoding and bytes to skip.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Storage {
     pub(crate) encoding: Encoding,
@@ -79,8 +79,8 @@ pub(crate) struct Storage {
     pub(crate) skip_field: &'static str,
 }
 
-/// Reads the samples from a source at the start of its `len` bytes of data. `part` says which of the
-/// file's samples they are, if they are not all.
+/// Reads the samples from a source at the start of its `len` bytes of data. `part` says which of
+/// the file's samples they are, if they are not all.
 pub(crate) fn read(
     source: Source,
     len: u64,
@@ -96,7 +96,7 @@ pub(crate) fn read(
     };
     let whole = part.whole_bytes();
     if storage.encoding == Encoding::Raw && part.is_run() {
-        // What lies before is not read.
+        // Bytes before the part are not read.
         let start = part.start();
         let skip = match storage.byte_skip {
             Skip::Bytes(skip) if len.saturating_sub(skip) < part.end() => {

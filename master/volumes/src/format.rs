@@ -1,4 +1,5 @@
-//! Formats that are told by their first bytes, plain or inside gzip, and read from front to back.
+//! Formats that are recognised by their first bytes, plain or inside gzip, and read from front to
+//! back.
 
 use crate::error::Problem;
 use crate::reads::{self, ReadFormat};

@@ -1,4 +1,4 @@
-//! The outline of what can be seen of a volume, to which paths are framed.
+//! Finds the outline of the visible part of a volume, and frames paths to it.
 //!
 //! The box of all visible voxels would be cheap and wrong: a scanner's noise puts a voxel here and
 //! there above any threshold, and one in a corner would decide the picture. Cutting a share of the
@@ -23,19 +23,20 @@ use std::sync::{Arc, Mutex, PoisonError};
 /// Edge of a cell in voxels.
 const EDGE: usize = 8;
 
-/// Visible voxels that a cell of 512 must have to count. A wire of one voxel that crosses a cell has
-/// 8 of them. At 4, noise of one voxel in 500 (an angiogram at its lower threshold) fills some cell
-/// of every corner; at 16, tips of a few voxels are lost.
+/// Visible voxels that a cell of 512 must have to count. A wire of one voxel that crosses a cell
+/// has 8 of them. At 4, noise of one voxel in 500 (an angiogram at its lower threshold) fills some
+/// cell of every corner; at 16, tips of a few voxels are lost.
 const DENSE: usize = 8;
 
-/// Returns index positions of visible voxels whose hull holds all visible voxels but lonely ones: of
-/// each layer k its hull, in ascending order. Visible are the codes of `support` within `crop`.
+/// Returns index positions of visible voxels whose hull holds all visible voxels except lonely
+/// ones: the hull of each layer k, in ascending order. Voxels within `crop` are visible if
+/// `support` has their code.
 pub fn outline(volume: &Volume, support: &Support, crop: Option<&CropBox>) -> Vec<[u32; 3]> {
     let source = MemorySource::new(volume, Digest32::default());
     outline_of(&source, 0, support, crop).expect("samples in memory can be read")
 }
 
-/// Returns [`outline`] of a level of a source, in index positions of the level.
+/// Returns the outline of a level of a source ([`outline`]), in index positions of the level.
 ///
 /// # Errors
 /// A file can't be read, or is damaged.
@@ -89,11 +90,11 @@ fn outline_of(
         Ok(layers?.concat())
     };
     let dense = of(DENSE)?;
-    // All that there is may be a few voxels.
+    // A volume with only a few visible voxels has no dense cell: then all of them count.
     if dense.is_empty() { of(1) } else { Ok(dense) }
 }
 
-/// Codes of slices of a volume, of which layers of cells are looked at.
+/// Codes of some slices of a volume, in which layers of cells are searched.
 struct Layer<'a, T, S, I> {
     codes: &'a [T],
     /// Samples of the volume along each axis.
@@ -105,7 +106,7 @@ struct Layer<'a, T, S, I> {
 }
 
 impl<T: Copy, S: Fn(T) -> bool, I: Fn([u32; 3]) -> bool> Layer<'_, T, S, I> {
-    /// The hulls of the slices of one layer of cells.
+    /// Returns the hulls of the slices of one layer of cells.
     fn hulls(&self, slices: std::ops::Range<usize>, dense: usize) -> Vec<[u32; 3]> {
         let [nx, ny, _] = self.dims;
         let cells = [nx.div_ceil(EDGE), ny.div_ceil(EDGE)];
@@ -147,7 +148,8 @@ impl<T: Copy, S: Fn(T) -> bool, I: Fn([u32; 3]) -> bool> Layer<'_, T, S, I> {
     }
 }
 
-/// The lower side of the hull of points with ascending first coordinates (Andrew's chain).
+/// Returns the lower side of the hull of points with ascending first coordinates (Andrew's monotone
+/// chain).
 fn chain(points: impl Iterator<Item = [i64; 2]>) -> Vec<[i64; 2]> {
     let mut hull: Vec<[i64; 2]> = Vec::new();
     for p in points {
@@ -163,12 +165,12 @@ fn chain(points: impl Iterator<Item = [i64; 2]>) -> Vec<[i64; 2]> {
     hull
 }
 
-/// Returns the framing of a path that asks for one; `None` if it doesn't, or nothing can be seen. It
-/// does not depend on the quality. `transfer` is the function of all frames that have none of their
+/// Returns the framing of a path that asks for one; `None` if it doesn't, or nothing is visible. It
+/// does not depend on the quality. `transfer` is the function of all frames without one of their
 /// own.
 ///
 /// # Errors
-/// The field of the path or function that doesn't fit the volume.
+/// Names the field of the path or function that doesn't fit the volume.
 pub fn framing(
     path: &ViewPath,
     volume: &Volume,
@@ -183,11 +185,11 @@ pub fn framing(
     })
 }
 
-/// Samples of the level at which a path is framed, at most. Larger volumes are framed to a coarser
-/// level: half a sample of it is a thousandth of the picture.
+/// Most samples of the level at which a path is framed. Larger volumes are framed to a coarser
+/// level, where half a sample is a thousandth of the picture.
 const MOST_SAMPLES: u64 = 1 << 28;
 
-/// Why a path can't be framed.
+/// Reason for which a path can't be framed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum FramingError {
     /// A field of the path or function doesn't fit the volume.
@@ -236,11 +238,12 @@ impl Outlines {
     }
 }
 
-/// Returns the framing of a path like [`framing`], to a volume that is read in boxes. Positions are
-/// those of its finest level. `outlines` are those of `source` that are known.
+/// Returns the framing of a path to a volume that is read in boxes, in positions of its finest
+/// level; `None` if the path doesn't ask for one, or nothing is visible. `outlines` caches the
+/// outlines of `source`.
 ///
 /// # Errors
-/// The field of the path or function that doesn't fit the volume; or a file that can't be read.
+/// A field of the path or function doesn't fit the volume, or a file can't be read.
 pub fn framing_of(
     path: &ViewPath,
     source: &dyn BlockSource,
@@ -265,7 +268,8 @@ pub fn framing_of(
     Ok(path.framing(&points, &finest.lattice, orientation)?)
 }
 
-/// Returns the sample of the finest level nearest to the centre of one of another level.
+/// Returns the sample of the finest level that is nearest to the centre of sample `point` of
+/// another level.
 fn in_finest(levels: &[VolumeInfo], level: usize, point: [u32; 3]) -> [u32; 3] {
     let (finest, coarse) = (&levels[0].lattice, &levels[level].lattice);
     std::array::from_fn(|a| {

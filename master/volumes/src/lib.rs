@@ -34,8 +34,8 @@
 //! - Zarr arrays of versions 2 and 3, and OME-Zarr pyramids (feature `zarr`)
 //! - volumes by formula: `formula:NAME`
 //!
-//! [`write`](mod@write) writes NRRD and NIfTI-1. [`blocks`] reads and writes volumes larger than memory.
-//! Not read: time series.
+//! [`write`](mod@write) writes NRRD and NIfTI-1. [`blocks`] reads and writes volumes larger than
+//! memory. Not read: time series.
 //!
 //! Input files are not trusted. A size in a header takes no memory before the bytes were seen;
 //! nothing outside the header's folder is read; every refusal is one line that names the file, the
@@ -144,32 +144,33 @@ pub struct Opened {
     pub notes: Vec<String>,
 }
 
-/// Opens a volume: a file or folder, whose format its content decides and not its name, or
-/// `formula:NAME[:SIZE]` (see [`formula`]).
+/// Opens a volume: a file or folder, or `formula:NAME[:SIZE]` (see [`formula`]). The content of a
+/// file decides its format, not its name.
 ///
 /// # Errors
-/// The file can't be read, is no volume, is malformed, truncated or damaged, is of a kind that is
-/// not read, points outside its folder, or exceeds a limit or the memory. The error's
-/// [`kind`](Problem::kind) tells these apart.
+/// The file can't be read, is not a volume, is malformed, truncated or damaged, has an unsupported
+/// format, points outside its folder, or exceeds a limit or the memory. The error's
+/// [`kind`](Problem::kind) distinguishes these.
 pub fn open(path: &Path) -> Result<Volume, OpenError> {
     open_with(path, &Hints::default()).map(|opened| opened.volume)
 }
 
-/// Opens a volume like [`open`], with hints, and returns the reader's notes with it.
+/// Opens a volume with hints; returns the reader's notes with it. Without hints it is the volume
+/// that [`open`] returns.
 ///
 /// # Errors
-/// Those of [`open`]. Also hints that contradict the file: a type or spacing for a file with a
-/// header, an unknown series or level, sizes that do not match the file's length.
+/// The volume can't be opened ([`open`]), or hints contradict the file: a type or spacing for a
+/// file with a header, an unknown series or level, sizes that do not match the file's length.
 pub fn open_with(path: &Path, hints: &Hints) -> Result<Opened, OpenError> {
     open_beside(path, &Hints { beside: Beside::new(false), ..hints.clone() })
 }
 
-/// Opens a volume like [`open_with`], to write it: also returns the file's own numbers where the
-/// volume's codes round them (integers of 32 and 64 bits, float64). These take up to 8 bytes a
+/// Opens a volume that will be written in another format. Also returns the file's own numbers if
+/// the volume's codes round them (integers of 32 and 64 bits, float64). These take up to 8 bytes a
 /// sample beside the volume.
 ///
 /// # Errors
-/// Those of [`open_with`].
+/// The volume can't be opened, or hints contradict the file ([`open_with`]).
 pub fn open_numbers(
     path: &Path,
     hints: &Hints,
@@ -254,8 +255,8 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
     Err(error)
 }
 
-/// Returns the header beside a data file: that of a pair, or one of the same stem with the data file's
-/// name inside.
+/// Returns the header beside a data file: the header of a pair, or one of the same stem that names
+/// the data file.
 fn header_beside(path: &Path) -> Option<PathBuf> {
     let name = path.file_name()?.to_str()?;
     let folder = Folder::open(path.parent()?, "file").ok()?;
@@ -372,7 +373,7 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
     Err(Problem::new(OpenErrorKind::NotAVolume, "content", describe(head, name), reads::remedy()))
 }
 
-/// Returns the first bytes inside gzip, of which `head` are the first.
+/// Decompresses the first bytes of a gzip file that begins with `head`.
 fn unpacked(head: &[u8]) -> Vec<u8> {
     let mut start = Vec::new();
     // The reader reports an early end or damage.

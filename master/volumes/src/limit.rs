@@ -1,4 +1,4 @@
-//! How many bytes of samples a file may become before somebody is asked.
+//! Limit on the bytes of samples that a file may become without `--max-bytes`.
 //!
 //! A size in a header is checked against the bytes that are there ([`crate::samples::Supply`]), so
 //! no header lies for long. But a file of 8 MB may say honestly that it becomes 8 GiB: zeros shrink
@@ -42,8 +42,8 @@ impl ByteCap {
         self.check_within(need, stored, field, free_memory)
     }
 
-    /// Checks samples of `need` bytes against the limit that the user gave, if there is one: what is
-    /// read in parts is more than each of them.
+    /// Checks samples of `need` bytes against the limit that the user gave, if there is one: what
+    /// is read in parts is more than each of them.
     ///
     /// # Errors
     /// [`OpenErrorKind::TooLarge`], with the figures and the flag.

@@ -11,7 +11,7 @@ use bzip2::bufread::BzDecoder;
 use flate2::bufread::{GzDecoder, ZlibDecoder};
 use std::io::{BufRead, Error, ErrorKind, Read};
 
-/// Most bytes of padding that are looked at; 1 GiB/s reads them in 0.06 s.
+/// Most bytes of padding that are read; at 1 GiB/s they take 0.06 s.
 const PADDING_SEEN_BYTES: u64 = 64 << 20;
 
 /// Compression of a file. All but zlib allow several streams one after another.

@@ -93,7 +93,8 @@ pub(crate) mod tests {
     use crate::fuzz::gzip;
     use std::path::Path;
 
-    /// A volume of 4 x 3 x 2 samples 0, 1, 2, ..., with FreeSurfer's directions and a footer.
+    /// Returns a volume of 4 x 3 x 2 samples 0, 1, 2, ..., with FreeSurfer's directions and a
+    /// footer.
     pub(crate) fn mgh(kind: i32, placed: bool) -> Vec<u8> {
         let mut out = Vec::new();
         for n in [1, 4, 3, 2, 1, kind, 0] {

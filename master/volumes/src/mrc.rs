@@ -47,8 +47,8 @@ impl Header {
         [0, 1, 2].map(|a| self.float(first + a))
     }
 
-    /// Returns the axes of the cell along columns, rows and sections, 0 for x; `None` if they are not
-    /// three different ones. Zeros, which some programs leave, mean x, y and z.
+    /// Returns the axes of the cell along columns, rows and sections, 0 for x; `None` if they are
+    /// not three different ones. Zeros, which some programs leave, mean x, y and z.
     fn axes(&self) -> Option<[usize; 3]> {
         let axes = self.words(17);
         if axes == [0; 3] {
@@ -263,7 +263,7 @@ pub(crate) mod tests {
     use crate::fuzz::gzip;
     use std::path::Path;
 
-    /// A map of 4 x 3 x 2 samples 0, 1, 2, ... in steps of 1, 2 and 3 angstrom.
+    /// Returns a map of 4 x 3 x 2 samples 0, 1, 2, ... in steps of 1, 2 and 3 angstrom.
     pub(crate) fn mrc(big: bool, mode: i32, axes: [i32; 3], marked: bool) -> Vec<u8> {
         let mut out = vec![0; HEADER_BYTES];
         let mut put = |index: usize, n: i32| {

@@ -161,7 +161,7 @@ fn check_magic(line: &str) -> Result<(), Problem> {
     }
 }
 
-/// Returns the usual spelling of a field that has two.
+/// Returns the usual spelling of a field's name; some fields have two.
 fn canonical_field(name: &str) -> String {
     match name {
         "datafile" => "data file",
@@ -178,7 +178,7 @@ fn canonical_field(name: &str) -> String {
 /// An interpreted header.
 struct Header {
     layout: Layout,
-    /// Part of the samples that is read; `None` reads all.
+    /// Part of the samples that is read; `None` for all.
     part: Option<Part>,
     notes: Vec<String>,
     lattice: Lattice,
@@ -431,7 +431,7 @@ impl Axes {
                 },
             )
         };
-        // What lies along an axis that is none of space.
+        // Describes an axis that does not lie in space.
         let other = |axis: usize| {
             let size = sizes[axis];
             let kind = kinds.get(axis).map(|k| k.to_ascii_lowercase()).unwrap_or_default();
@@ -439,7 +439,8 @@ impl Axes {
             match kind.as_str() {
                 "time" => Axis::new(Kind::Time, "times", size),
                 _ if time => Axis::new(Kind::Time, "times", size),
-                // Before the axes of space it is of each voxel.
+                // A list before the axes of space belongs to each voxel; after them it lists
+                // volumes.
                 "list" if axis > 0 => Axis::new(Kind::Other, "volumes (a list)", size),
                 "" | "none" | "???" | "domain" | "space" if axis > 0 => {
                     Axis::new(Kind::Other, format!("along axis {}", axis + 1), size)
@@ -464,9 +465,10 @@ impl Axes {
         }
         let mut kept = in_space;
         while kept.len() > 3 {
-            // Of four axes that may all be of space, those of one sample go, the last first.
+            // If more than three axes may lie in space, axes of one sample are dropped, the last
+            // first.
             let single = kept.iter().rposition(|a| sizes[*a] == 1);
-            // Nothing says which they are but the flag.
+            // Then only the flag can tell which axis lists volumes or channels.
             let asked = match pick {
                 Pick { volume: Some(_), .. } => Some(kept.len() - 1),
                 Pick { channel: Some(_), .. } => Some(0),
@@ -499,7 +501,7 @@ impl Axes {
         Ok(Axes { count, kept, sizes: kept.map(|a| sizes[a]), all: sizes, at, notes })
     }
 
-    /// Returns which part of the samples is read, if not all.
+    /// Returns the part of the samples that is read; `None` for all.
     fn part(&self, number: Number, fields: &Fields) -> Result<Option<Part>, Problem> {
         let several = self.at.iter().zip(&self.all).any(|(at, size)| at.is_some() && *size > 1);
         if !several {
@@ -548,8 +550,7 @@ fn lattice(fields: &Fields, axes: &Axes, dims: [u32; 3]) -> Result<(Lattice, boo
     Ok((lattice, anatomical))
 }
 
-/// Returns a field's numbers along the three kept axes; `None` where the format writes NaN for
-/// "unknown".
+/// Returns a field's numbers along the three kept axes; `None` for NaN, the format's "unknown".
 fn numbers(fields: &Fields, name: &str, axes: &Axes) -> Result<[Option<f64>; 3], Problem> {
     let mut found = [None; 3];
     let Some(words) = fields.per_axis(name, axes.count)? else { return Ok(found) };
@@ -562,18 +563,19 @@ fn numbers(fields: &Fields, name: &str, axes: &Axes) -> Result<[Option<f64>; 3],
     Ok(found)
 }
 
-/// What an axis spans (`axis mins`, `axis maxs`), which some files have in place of a spacing.
+/// Ends of the kept axes (`axis mins`, `axis maxs`), which some files have in place of a spacing.
 struct Ranges {
     mins: [Option<f64>; 3],
     maxs: [Option<f64>; 3],
-    /// Whether the ends are those of cells, with samples in their middles, and not samples.
+    /// Whether the ends are the outer faces of cells with samples in their middles. Otherwise the
+    /// first and the last sample lie at the ends.
     cells: [bool; 3],
 }
 
 impl Ranges {
     fn from_fields(fields: &Fields, axes: &Axes) -> Result<Ranges, Problem> {
         let centers = fields.per_axis("centers", axes.count)?;
-        // teem takes cells where a file does not say.
+        // Without `centers`, teem takes cells.
         let node = |axis: usize| centers.as_ref().is_some_and(|c| c[axis] == "node");
         Ok(Ranges {
             mins: numbers(fields, "axis mins", axes)?,
@@ -582,14 +584,15 @@ impl Ranges {
         })
     }
 
-    /// Returns the distance of `n` samples along an axis, if it is told.
+    /// Returns the distance between neighbours of `n` samples along an axis, if the file gives both
+    /// ends.
     fn step(&self, a: usize, n: u32) -> Option<f64> {
         let steps = f64::from(if self.cells[a] { n } else { n - 1 });
         let step = (self.maxs[a]? - self.mins[a]?) / steps;
         (step.is_finite() && step != 0.0).then_some(step)
     }
 
-    /// Returns where the first sample of an axis lies, if it is told.
+    /// Returns the position of the first sample along an axis, if the file gives it.
     fn first(&self, a: usize, step: f64) -> Option<f64> {
         let first = self.mins[a]? + if self.cells[a] { step / 2.0 } else { 0.0 };
         first.is_finite().then_some(first)
@@ -688,7 +691,7 @@ fn space(fields: &Fields) -> Result<Option<Space>, Problem> {
     let Some(name) = fields.get("space") else {
         return match fields.get("space dimension") {
             None => Ok(None),
-            // A volume of one time needs three of four.
+            // In a space of four dimensions, a volume at one time needs three.
             Some("3" | "4") => Ok(Some(Space { signs: DVec3::ONE, anatomical: false })),
             Some(_) => {
                 Err(fields.malformed("space dimension", "is not 3", "save it in a space of three"))

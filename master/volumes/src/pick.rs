@@ -1,14 +1,14 @@
-//! Which of a file's several volumes is read.
+//! Chooses one of several volumes of a file.
 //!
 //! Files hold times, echoes, channels and components beside the three axes of space. One rule holds
-//! for all formats: without a flag the first volume is read, and a note names the flag that takes
-//! another. Where a voxel is several numbers beside each other (colours, vectors), none of them is
-//! the volume, and the refusal names `--channel`.
+//! for all formats: without a flag the first volume is read, and a note names the flag for another.
+//! If a voxel has several numbers (colours, vectors), none of them alone is the volume; the file is
+//! refused, and the error names `--channel`.
 
 use crate::error::Problem;
 use std::io::Read;
 
-/// Which of several volumes to read; the first where nothing is asked.
+/// User's choice among several volumes; an index that is `None` was not asked for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Pick {
     /// Index among all volumes of the file, 0 the first, in the file's order.
@@ -19,7 +19,7 @@ pub struct Pick {
     pub channel: Option<u64>,
 }
 
-/// Kind of an axis that is none of space.
+/// Kind of an axis that does not lie in space.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
     Time,
@@ -27,15 +27,15 @@ pub(crate) enum Kind {
     Other,
 }
 
-/// An axis that is none of space.
+/// An axis that does not lie in space.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Axis {
     pub(crate) kind: Kind,
-    /// What lies along it, for notes: `times`, or `along axis 3`.
+    /// Name of its entries, for notes: `times`, or `along axis 3`.
     pub(crate) name: String,
     pub(crate) size: u64,
-    /// Whether the axis holds the components of each voxel (colours, vectors): its first entry alone is no
-    /// volume.
+    /// Whether the axis holds the components of each voxel (colours, vectors). Then its first entry
+    /// alone is not the volume.
     pub(crate) of_voxel: bool,
     /// Whether these components are red, green, blue and perhaps alpha.
     pub(crate) colours: bool,
@@ -46,35 +46,37 @@ impl Axis {
         Axis { kind, name: name.into(), size, of_voxel: false, colours: false }
     }
 
-    /// Returns the axis of a voxel's numbers, which may be colours.
+    /// Returns an axis of the numbers that each voxel has; `colours` tells whether these are
+    /// colours.
     pub(crate) fn of_voxel(name: impl Into<String>, size: u64, colours: bool) -> Axis {
         Axis { of_voxel: true, colours, ..Axis::new(Kind::Channel, name, size) }
     }
 }
 
 impl Pick {
-    /// Returns which of the `channels` numbers of a pixel is read: the only one, or the one that
-    /// `--channel` says. Three and four are colours.
+    /// Returns the index of the number that is read, among the `channels` numbers of a pixel: 0 if
+    /// there is one, else the index of `--channel`. Three and four are colours.
     ///
     /// # Errors
-    /// As [`Pick::choose`].
+    /// There is no such number; a flag asks for an axis that the file does not have; a pixel has
+    /// several numbers, and no flag is given.
     pub(crate) fn of_pixel(&self, channels: u64, field: &str) -> Result<u64, Problem> {
         let name = if channels == 4 { "colours (RGBA)" } else { "colours (RGB)" };
         let only_channel = Pick { channel: self.channel, ..Pick::default() };
         Ok(only_channel.choose(&[Axis::of_voxel(name, channels, true)], field)?.0[0])
     }
 
-    /// Returns what is asked beside the channel.
+    /// Returns the choice without its channel.
     pub(crate) fn without_channel(&self) -> Pick {
         Pick { channel: None, ..*self }
     }
 
-    /// Returns an index along each of `axes`, the fastest first, and notes on those that nobody
-    /// asked for. `field` is the file's name for the axes.
+    /// Returns an index along each of `axes`, the fastest first, and notes on the axes without a
+    /// flag. `field` is the file's name for the axes.
     ///
     /// # Errors
-    /// An index that is not there; a flag for an axis that the file does not have; a voxel of
-    /// several numbers without a flag.
+    /// There is no such index; a flag asks for an axis that the file does not have; a voxel has
+    /// several numbers, and no flag is given.
     pub(crate) fn choose(
         &self,
         axes: &[Axis],
@@ -149,13 +151,13 @@ impl Pick {
     }
 }
 
-/// The part of a file's samples that is read: all axes, the fastest first, some of them at one index.
+/// Part of a file's samples: all axes, the fastest first, some of them restricted to one index.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Part {
     sizes: Vec<u64>,
     /// Index along each axis; `None` along axes that are read whole.
     at: Vec<Option<u64>>,
-    /// Bytes of a number.
+    /// Size of a number in bytes.
     bytes: u64,
 }
 
@@ -166,7 +168,7 @@ impl Part {
         Some(Part { sizes: sizes.to_vec(), at, bytes })
     }
 
-    /// Returns the bytes of all samples of the file.
+    /// Returns the size of all samples of the file in bytes.
     pub(crate) fn whole_bytes(&self) -> u64 {
         self.bytes * self.sizes.iter().product::<u64>()
     }
@@ -179,19 +181,19 @@ impl Part {
         })
     }
 
-    /// Returns the place of the first byte that is read.
+    /// Returns the offset of the first byte that is read.
     pub(crate) fn start(&self) -> u64 {
         self.strides().zip(&self.at).map(|(stride, at)| stride * at.unwrap_or(0)).sum()
     }
 
-    /// Returns the place after the last byte that is read.
+    /// Returns the offset after the last byte that is read.
     pub(crate) fn end(&self) -> u64 {
         let axes = self.strides().zip(self.sizes.iter().zip(&self.at));
         axes.map(|(stride, (size, at))| stride * at.unwrap_or(size.saturating_sub(1))).sum::<u64>()
             + self.bytes
     }
 
-    /// Returns whether all bytes that are read lie one after another.
+    /// Returns whether the part is one run: all its bytes lie one after another.
     pub(crate) fn is_run(&self) -> bool {
         let wanted: u64 = self
             .sizes
@@ -203,7 +205,8 @@ impl Part {
         self.end() - self.start() == wanted * self.bytes
     }
 
-    /// Returns a reader of the part from one of all samples, which stops after the part's end.
+    /// Returns a reader of the part. `inner` reads all samples of the file; nothing after the
+    /// part's end is read from it.
     pub(crate) fn reader<R: Read>(&self, inner: R) -> PartReader<R> {
         // Leading axes that are read whole make a run; the others are counted.
         let lead = self.at.iter().take_while(|at| at.is_none()).count();
@@ -225,16 +228,16 @@ impl Part {
     }
 }
 
-/// Reads the runs of a [`Part`].
+/// Reader of the runs of a [`Part`].
 pub(crate) struct PartReader<R> {
     inner: R,
-    /// Bytes of a run.
+    /// Length of a run in bytes.
     run: u64,
     /// Axes that runs go along: stride in bytes, size, and index of the next run.
     axes: Vec<(u64, u64, u64)>,
-    /// Place of the next run; `None` after the last.
+    /// Offset of the next run; `None` after the last.
     next: Option<u64>,
-    /// Place of the next byte.
+    /// Offset of the next byte of `inner`.
     at: u64,
     /// Bytes to drop before the current run.
     skip: u64,
@@ -282,13 +285,14 @@ impl<R: Read> Read for PartReader<R> {
                     (self.at, self.left) = (self.at + n as u64, self.left - n as u64);
                     return Ok(n);
                 }
-                // What follows the part is not read: it may not be there.
+                // Bytes after the part are not read, since the file may end there.
                 let more = if self.next.is_some() { u64::MAX } else { self.skip + self.left };
                 self.block.resize(more.min(BLOCK_BYTES as u64) as usize, 0);
                 self.used = self.block.len();
                 match self.inner.read(&mut self.block) {
                     Ok(n) => self.block.truncate(n),
-                    // What was copied is handed out; the error comes again.
+                    // The bytes copied so far are returned first; the next call meets the error
+                    // again.
                     Err(_) if done > 0 => break,
                     Err(e) => return Err(e),
                 }

@@ -1,10 +1,10 @@
 //! Coefficients of the cubic B-spline that passes through a volume's samples.
 //!
-//! A B-spline of the samples themselves blurs them; of these coefficients it interpolates them (Unser,
-//! Aldroubi, Eden, "B-spline signal processing", 1993). Each axis is filtered forwards and backwards
-//! with the pole `sqrt(3) - 2`; beyond its ends the volume is its mirror image. The pass takes four bytes a
-//! voxel for as long as bricks are cut. Each sample has its own order of additions, so the coefficients
-//! do not depend on the number of threads.
+//! A B-spline with the samples as coefficients blurs them; with these coefficients it interpolates
+//! them (Unser, Aldroubi, Eden, "B-spline signal processing", 1993). Each axis is filtered forwards
+//! and backwards with the pole `sqrt(3) - 2`; the volume is mirrored at its ends. The coefficients
+//! take four bytes a voxel for as long as bricks are cut. The order of additions is fixed for each
+//! sample, so the coefficients do not depend on the number of threads.
 
 use rayon::prelude::*;
 use slabcast_common::volume::{Samples, Volume};
@@ -15,15 +15,15 @@ const POLE: f32 = -0.267_949_2;
 /// Gain of the filter, which keeps a constant as it is.
 const GAIN: f32 = 6.0;
 
-/// Samples from which the forward pass begins: the pole to this power is 1e-7.
+/// Number of samples that the first value of the forward pass sums: the pole to this power is 1e-7.
 const BEGIN: usize = 12;
 
-/// Returns the coefficients of all samples, in codes, in the order of the samples. They are cut off at
-/// all codes' length beyond the smallest and the largest code. Samples that are NaN count as the
-/// smallest code for their neighbours and stay NaN.
+/// Returns the coefficients of all samples, in codes, in the order of the samples. With the
+/// volume's codes from `lo` to `hi`, coefficients are clamped to `2 lo - hi` and `2 hi - lo`. NaN
+/// samples stay NaN; for their neighbours they count as the smallest code.
 ///
-/// A layer is filtered along x and y while the cache holds it, and so are the samples of a row in all
-/// layers along z: memory is read and written twice in all.
+/// Each layer is filtered along x and y while it is in the cache. Then each row is filtered along z
+/// through all layers. So memory is read and written twice in all.
 pub(crate) fn coefficients(volume: &Volume) -> Vec<f32> {
     let summary = &volume.summary;
     let (lo, hi) = (summary.min_code as f32, summary.max_code as f32);
@@ -65,10 +65,10 @@ pub(crate) fn coefficients(volume: &Volume) -> Vec<f32> {
     all
 }
 
-/// Rows that are filtered at once: additions of one row wait for each other.
+/// Rows that are filtered at once, since each addition of a row waits for the one before.
 const ROWS: usize = 8;
 
-/// Filters each row of `n` samples.
+/// Filters each row of `n` samples in place.
 fn filter_along(rows: &mut [f32], n: usize) {
     if n < 2 {
         return;
@@ -78,7 +78,7 @@ fn filter_along(rows: &mut [f32], n: usize) {
     some.into_remainder().chunks_exact_mut(n).for_each(|row| filter_rows::<1>(row, n));
 }
 
-/// Filters `R` rows of `n` samples.
+/// Filters `R` rows of `n` samples in place.
 fn filter_rows<const R: usize>(rows: &mut [f32], n: usize) {
     let mut rest = rows;
     let rows: [&mut [f32]; R] =
@@ -108,7 +108,7 @@ fn filter_rows<const R: usize>(rows: &mut [f32], n: usize) {
     }
 }
 
-/// Filters rows of equal length along the direction across them.
+/// Filters rows of equal length in place, across the rows: from one row to the next.
 fn filter_across(rows: &mut [&mut [f32]]) {
     let n = rows.len();
     if n < 2 {
@@ -134,8 +134,8 @@ fn filter_across(rows: &mut [&mut [f32]]) {
     }
 }
 
-/// What the first value of the forward pass is the sum of: powers of the pole, each with the index of
-/// its sample in the mirrored row.
+/// Iterates over the terms of the first value of the forward pass, in a mirrored row of `n`
+/// samples: a power of the pole, and the index of the sample that it weighs.
 fn mirrored(n: usize) -> impl Iterator<Item = (f32, usize)> {
     let period = 2 * (n - 1);
     let powers = std::iter::successors(Some(1.0), |power| Some(power * POLE));
@@ -145,7 +145,8 @@ fn mirrored(n: usize) -> impl Iterator<Item = (f32, usize)> {
     })
 }
 
-/// The last value of the backward pass, from the last two of the forward pass.
+/// Returns the first value of the backward pass, which is the row's last coefficient. `before` and
+/// `last` are the last two values of the forward pass.
 fn end(last: f32, before: f32) -> f32 {
     POLE / (POLE * POLE - 1.0) * (last + POLE * before)
 }
@@ -154,7 +155,7 @@ fn end(last: f32, before: f32) -> f32 {
 mod tests {
     use super::*;
 
-    /// [`coefficients`] plainly: sample by sample along one axis after the other.
+    /// Computes [`coefficients`] by the plain loop: sample by sample, one axis after the other.
     fn plain(volume: &Volume) -> Vec<f32> {
         let summary = &volume.summary;
         let (lo, hi) = (summary.min_code as f32, summary.max_code as f32);
@@ -208,7 +209,7 @@ mod tests {
         }
     }
 
-    /// The B-spline of coefficients at the sample `at`.
+    /// Returns the value of the B-spline with coefficients `c` at sample `at`.
     fn spline(c: &[f32], dims: [u32; 3], at: [u32; 3]) -> f64 {
         let weights = [1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0];
         let mut sum = 0.0;
@@ -233,7 +234,7 @@ mod tests {
     #[test]
     fn splines_of_coefficients_pass_through_the_samples() {
         for dims in [[9, 7, 8], [1, 5, 2], [2, 1, 1], [1, 1, 1]] {
-            // Not so rough that coefficients are cut off.
+            // Smooth enough that no coefficient is clamped.
             let waves = |i: u32, j: u32, k: u32| {
                 let [x, y, z] = [i, j, k].map(f64::from);
                 (100.0 + 50.0 * libm::sin(x) * libm::cos(1.3 * y + 0.7 * z)) as u8

@@ -151,7 +151,7 @@ pub(crate) fn read(
     }
     let lattice = Lattice::from_spacing(layout.dims, known.spacing.unwrap_or([1.0; 3]));
     lattice.check().map_err(|e| Problem::malformed("--spacing", e, "give three lengths"))?;
-    // What the name said is a guess.
+    // Facts from the file's name are guesses, so a note tells them.
     if hints.dims.is_none() || hints.number.is_none() {
         let order = match (number.bytes(), endian) {
             (1, _) => "",

@@ -147,7 +147,7 @@ pub(crate) fn remedy() -> String {
     format!("give {} or {last}", others.join(", "))
 }
 
-/// Returns the endings that are no longer form of another: not `.vtk.gz`.
+/// Returns a format's endings without those that only lengthen another, such as `.vtk.gz`.
 fn shortest(format: &ReadFormat) -> Vec<&'static str> {
     format.endings.iter().filter(|e| !e.ends_with(".gz")).take(3).copied().collect()
 }
@@ -169,7 +169,7 @@ pub fn endings() -> impl Iterator<Item = &'static str> {
     with_header.flat_map(|f| f.endings.iter().copied())
 }
 
-/// Returns whether a file's name ends as that of a volume or of raw numbers.
+/// Returns whether a file's name has the ending of a volume or of raw numbers.
 pub(crate) fn is_volume_name(name: &str) -> bool {
     let name = name.to_ascii_lowercase();
     endings().chain(RAW.endings.iter().copied()).any(|end| name.ends_with(end))

@@ -1,6 +1,6 @@
 //! Converts a file's numbers, of any type and byte order, to [`Samples`].
 //!
-//! How each type is kept:
+//! The codes of each type:
 //!
 //! | file | codes | value of code c |
 //! |---|---|---|
@@ -12,8 +12,9 @@
 //! | other float64 | f32 in 0..1 | min + c (max - min) |
 //!
 //! A 32-bit integer with a wide range loses its low bits (f32 has 24), as in every renderer that
-//! samples floats. One value far beyond all others (-3e38) stands for none and becomes NaN. The shift by the minimum keeps the span. A note says so, or the numbers are kept
-//! beside the codes ([`crate::numbers`]).
+//! samples floats. One value far beyond all others (-3e38) stands for none and becomes NaN. The
+//! shift by the minimum keeps the span. A note says so, or the numbers are kept beside the codes
+//! ([`crate::numbers`]).
 
 use crate::error::{OpenErrorKind, Problem};
 use crate::limit::ByteCap;

@@ -213,7 +213,7 @@ impl Folder {
     /// `None` for one that leads out. A dangling link leads out, wherever it points.
     fn real_path(&self, name: &Path) -> Option<Option<PathBuf>> {
         let whole = self.path.join(name);
-        // What lies below the last step that is there is missing.
+        // `there` is the longest part of the path that exists.
         let there = whole.ancestors().find(|step| step.symlink_metadata().is_ok())?;
         let real = there.canonicalize().ok().filter(|real| real.starts_with(&self.path))?;
         Some((there == whole).then_some(real))

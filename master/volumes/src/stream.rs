@@ -1,9 +1,10 @@
-//! Reads a file's numbers in order, without holding them.
+//! Streams a file's numbers in order, without holding them.
 //!
 //! Every reader of a format ends in [`crate::samples::read`], which makes a list of samples. With a
-//! [`NumberStream`] beside it, the reader hands the bytes on as they come, and returns a volume without
-//! samples: its lattice, names and rescale are those of the file. So each format is streamed that is
-//! read in the order of its samples; what needs all of them at once is refused ([`NumberStream::refuse`]).
+//! [`NumberStream`], that function sends the bytes on as they are read, and the reader returns a
+//! volume without samples, with the file's lattice, names and rescale. So every format that is read
+//! in the order of its samples can be streamed. A reader that needs all samples at once refuses
+//! ([`NumberStream::refuse`]).
 
 use crate::error::Problem;
 use crate::samples::Layout;
@@ -14,12 +15,12 @@ use std::sync::mpsc::Sender;
 use std::sync::mpsc::{Receiver, SyncSender};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Chunks of 128 KiB that a reader may be ahead of who takes them: 64 MiB, so that a disk has work while
-/// planes are looked at.
+/// Chunks of 128 KiB that a reader may be ahead of the receiver: 64 MiB, so that the disk has work
+/// while planes are surveyed.
 #[cfg(feature = "zarr")]
 pub(crate) const CHUNKS_AHEAD: usize = 512;
 
-/// Takes the numbers of one file. Clones share it.
+/// Stream of the numbers of one file. Clones share it.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct NumberStream(Arc<Mutex<State>>);
 
@@ -47,10 +48,10 @@ pub(crate) struct ChunkReceiver {
 }
 
 impl ChunkSender {
-    /// Hands on the next bytes.
+    /// Sends the next bytes.
     ///
     /// # Errors
-    /// Nobody takes them any more.
+    /// The receiver was dropped.
     pub(crate) fn send(&mut self, bytes: &[u8]) -> Result<(), Problem> {
         let mut chunk = self.spare.try_recv().unwrap_or_default();
         chunk.clear();
@@ -60,7 +61,7 @@ impl ChunkSender {
 }
 
 impl NumberStream {
-    /// Returns a stream for a header alone, and with a sender one for all numbers.
+    /// Returns a stream for all numbers of a file, or without a sender for its header alone.
     #[cfg(feature = "zarr")]
     pub(crate) fn new(sender: Option<ChunkSender>) -> NumberStream {
         NumberStream(Arc::new(Mutex::new(State { sender, ..State::default() })))
@@ -70,11 +71,11 @@ impl NumberStream {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Tells the layout of the numbers that come. Returns who takes them; nobody if the header is all
-    /// that is wanted.
+    /// Sets the layout of the numbers that follow. Returns their sender; `None` if only the header
+    /// is wanted.
     ///
     /// # Errors
-    /// A second list of numbers, such as a mask.
+    /// The file has a second list of numbers, such as a mask.
     pub(crate) fn begin(&self, layout: &Layout) -> Result<Option<ChunkSender>, Problem> {
         let mut state = self.state();
         if state.layout.replace(*layout).is_some() {
@@ -84,7 +85,7 @@ impl NumberStream {
         Ok(state.sender.take())
     }
 
-    /// Says that the file can't be read in order, and returns an error that says so.
+    /// Marks the file as one that can't be read in order, and returns the error for it.
     pub(crate) fn refuse(&self) -> Problem {
         self.state().refused = true;
         Problem::unsupported(
@@ -100,17 +101,17 @@ impl NumberStream {
         self.state().refused
     }
 
-    /// Tells where in a file the numbers begin, if they lie there as they are.
+    /// Sets the place at which the numbers begin, in a file that stores them uncompressed.
     pub(crate) fn set_place(&self, file: Option<File>, at: std::io::Result<u64>) {
         self.state().place = file.zip(at.ok());
     }
 
-    /// Says that the numbers do not lie in one piece.
+    /// Removes the place, since the numbers do not lie in one piece.
     pub(crate) fn forget_place(&self) {
         self.state().place = None;
     }
 
-    /// Returns the layout of the numbers, and their place if they lie in a file as they are.
+    /// Returns the layout of the numbers, and their place if a file stores them uncompressed.
     #[cfg(feature = "zarr")]
     pub(crate) fn found(&self) -> (Option<Layout>, Option<(File, u64)>) {
         let mut state = self.state();
@@ -118,7 +119,7 @@ impl NumberStream {
     }
 }
 
-/// Returns a volume of `samples` like [`Volume::new`]; one without samples if a stream took them.
+/// Returns a volume of `samples`; a volume without samples if a stream took them.
 pub(crate) fn volume(
     name: impl Into<String>,
     file_type: impl Into<String>,

@@ -142,7 +142,7 @@ pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Opene
     Ok(Opened { volume, notes })
 }
 
-/// Byte order of bands, which the `tiff` crate decodes to that of the machine.
+/// Byte order of bands: the `tiff` crate decodes them to the machine's.
 const NATIVE: Endian = if cfg!(target_endian = "big") { Endian::Big } else { Endian::Little };
 
 /// Returns the supply of pages in files of `len` bytes. LZW is the densest encoding read: a code of

@@ -1,4 +1,4 @@
-//! Units of length in files, and distances of samples of which some have none.
+//! Units of length in files, and distances between samples, some of which may lack a unit.
 //!
 //! A step without a unit, or with an unknown one, is never counted as millimetres beside steps in
 //! micrometres: the volume would be a thousand times too long along one axis.
@@ -123,8 +123,8 @@ pub(crate) struct Step {
 
 /// Returns the distances of samples along x, y and z, and the millimetres of each axis's unit.
 ///
-/// An axis without a known unit gets that of another axis, or millimetres if none has one. A step
-/// that is missing becomes that of another axis, or 1. A note says each of these.
+/// An axis without a known unit takes another axis's unit, or millimetres if no axis has one. A
+/// missing step takes another axis's step, or 1. A note tells each of these.
 pub(crate) fn steps_in_mm(steps: &[Step; 3], notes: &mut Vec<String>) -> ([f64; 3], [f64; 3]) {
     const NAMES: [&str; 3] = ["x", "y", "z"];
     let known = |a: usize| steps[a].unit.as_deref().and_then(millimetres);

@@ -8,7 +8,7 @@ use crate::samples::{Number, Supply};
 use crate::source::Notes;
 use std::io::{BufRead, Read};
 
-/// How samples are encoded.
+/// Encoding of samples.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Encoding {
     Raw,
@@ -61,11 +61,11 @@ impl Encoding {
 /// Reader of one xz stream.
 pub(crate) type Xz<R> = lzma_rust2::XzReader<R>;
 
-/// Most bytes that a byte of xz stands for: a match of 273 bytes takes at least some ten decisions of
-/// 1/45 bit each.
+/// Most bytes that a byte of xz stands for: a match of 273 bytes takes at least some ten decisions
+/// of 1/45 bit each.
 pub(crate) const XZ_RATIO: u64 = 1 << 14;
-/// Most memory of an xz decoder: the dictionary of `xz -9`, 64 MiB, and 2 MiB beside it. It grows with
-/// what is decoded.
+/// Most memory of an xz decoder: the dictionary of `xz -9`, 64 MiB, and 2 MiB beside it. It grows
+/// with what is decoded.
 const XZ_MEMORY_KIB: u32 = 66 << 10;
 
 /// Returns a reader that decodes one xz stream.
@@ -73,8 +73,8 @@ pub(crate) fn xz<R: Read>(inner: R) -> Xz<R> {
     lzma_rust2::XzReader::new_mem_limit(inner, false, XZ_MEMORY_KIB)
 }
 
-/// Copies bytes of `piece` from `consumed` on into `buf`, as many as fit. Returns their number, by which
-/// `consumed` grows.
+/// Copies bytes of `piece` from `consumed` on into `buf`, as many as fit. Returns their number, by
+/// which `consumed` grows.
 pub(crate) fn copy_on(piece: &[u8], consumed: &mut usize, buf: &mut [u8]) -> usize {
     let n = (piece.len() - *consumed).min(buf.len());
     buf[..n].copy_from_slice(&piece[*consumed..*consumed + n]);

@@ -1,10 +1,10 @@
-//! Formats that are not read, told by their first bytes or their names, each with the program that
-//! converts it.
+//! Formats that are not read, recognised by their first bytes or their names, each with the program
+//! that converts it.
 
 use crate::error::{FLAT_REMEDY, OpenErrorKind, Problem};
 use crate::pictures;
 
-/// How a format is recognised.
+/// Mark by which a format is recognised.
 enum Mark {
     /// The file begins with these bytes.
     Begins(&'static [u8]),
@@ -173,7 +173,7 @@ pub(crate) fn problem(start: &[u8], gzip: bool, name: &str) -> Option<Problem> {
     Some(Problem::new(OpenErrorKind::NotAVolume, "content", what, remedy))
 }
 
-/// Returns what a file with these first bytes is (`is a BMP picture`), and the remedy.
+/// Returns the description of a file with these first bytes (`is a BMP picture`), and the remedy.
 pub(crate) fn known(start: &[u8], name: &str) -> Option<(&'static str, &'static str)> {
     let name = name.to_ascii_lowercase();
     let text = &start[..start.len().min(TEXT_BYTES)];

@@ -1,8 +1,8 @@
-//! Reader of VTK's legacy files (`.vtk`) with the data set STRUCTURED_POINTS: lines of text, between
-//! which arrays stand as text or as big-endian numbers.
+//! Reader of VTK's legacy files (`.vtk`) with the data set STRUCTURED_POINTS: lines of text,
+//! between which arrays stand as text or as big-endian numbers.
 //!
-//! One array is drawn: the one asked for, else the first with one number a point or cell. Those before
-//! it are skipped, since their sizes are told; what follows it is not read.
+//! One array is drawn: the one asked for, else the first with one number a point or cell. Arrays
+//! before it are skipped by their sizes; nothing after it is read.
 
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::samples::{self, Endian, Layout, Number, Supply};
@@ -20,7 +20,7 @@ const LINE_MAX_BYTES: u64 = 4096;
 /// Most lines without an array.
 const LINES_MAX: u32 = 100_000;
 
-/// Returns whether the first bytes are such a file, of any data set.
+/// Returns whether the first bytes are a legacy VTK file of any data set.
 pub(crate) fn sniff(start: &[u8]) -> bool {
     start.get(..MAGIC.len()).is_some_and(|m| m.eq_ignore_ascii_case(MAGIC))
 }
@@ -74,16 +74,16 @@ pub(crate) fn read(
                 let [count] = numbers(&words, &key)?;
                 grid.section = Some((key == "CELL_DATA", count));
             }
-            // Old text, and tables of colours.
+            // Tables of colours are skipped.
             "LOOKUP_TABLE" => {
                 let colours = words.get(2).and_then(|n| n.parse::<u64>().ok()).unwrap_or(0);
                 file.skip(text, colours.saturating_mul(4), 1, len)?;
             }
-            // Up to an empty line.
+            // Metadata are skipped up to an empty line.
             "METADATA" => while file.line()?.is_some_and(|line| !line.trim().is_empty()) {},
             "SCALARS" => {
                 let array = Array::scalars(&words, &grid)?;
-                // Its table is named in a line of its own, which may be missing.
+                // A line that names its table follows; it may be missing.
                 if file.starts_with("LOOKUP_TABLE")? {
                     file.line()?;
                 }
@@ -128,7 +128,7 @@ pub(crate) fn read(
                 seen.push(array.name.clone());
                 file.skip_array(text, &array, len)?;
             }
-            // Blank lines between arrays; the rest of an array is an error.
+            // Most likely the rest of an array with more numbers than its size says.
             _ => return Err(bad("line", format!("{} is no keyword", quoted(&line)))),
         }
     };
@@ -163,7 +163,7 @@ pub(crate) fn read(
     if array.shares
         && let Samples::F32(shares) = &samples
     {
-        // As VTK reads them.
+        // Shares become bytes with VTK's rounding.
         let mut bytes = Vec::new();
         samples::reserve(&mut bytes, shares.len())?;
         bytes.extend(shares.iter().map(|x| (255.0 * x + 0.5) as u8));
@@ -181,7 +181,7 @@ fn missing(what: &str) -> Problem {
     Problem::new(OpenErrorKind::Damaged, what, "is missing", "get the whole file")
 }
 
-/// Returns the error for a file without the wanted array; `seen` are the others.
+/// Returns the error for a file without the wanted array; `seen` are the names of its arrays.
 fn not_found(dataset: Option<&str>, seen: &[String]) -> Problem {
     let list: Vec<String> = seen.iter().take(6).map(|n| quoted(n)).collect();
     match dataset {
@@ -212,14 +212,14 @@ fn numbers<T: std::str::FromStr, const N: usize>(
         .map_err(|_| bad(field, format!("{} is not {N} numbers", quoted(&words[1..].join(" ")))))
 }
 
-/// The grid of points, and which data follow.
+/// The grid of points, and the kind of the data that follow.
 #[derive(Default)]
 struct Grid {
     /// Points along x, y and z.
     dims: Option<[u64; 3]>,
     spacing: [f64; 3],
     origin: [f64; 3],
-    /// Whether the data are of cells, and how many there are.
+    /// Whether the data belong to cells (else to points), and their number.
     section: Option<(bool, u64)>,
 }
 
@@ -289,7 +289,7 @@ impl Array {
             (None, Some(tuples)) => (false, tuples),
             (None, None) => return Err(bad("POINT_DATA", "is missing before the array")),
         };
-        // Data of the whole are no samples.
+        // Data of the whole data set are not samples.
         let drawn = grid.section.is_some_and(|(cells, _)| {
             grid.samples(cells).is_ok_and(|(d, _)| {
                 d.iter().try_fold(1u64, |n, x| n.checked_mul(*x)) == Some(count)
@@ -313,7 +313,7 @@ impl Array {
         })
     }
 
-    /// `SCALARS name type [components]`.
+    /// Parses the words of `SCALARS name type [components]`.
     fn scalars(words: &[&str], grid: &Grid) -> Result<Array, Problem> {
         let [_, name, kind, ..] = words else {
             return Err(bad("SCALARS", "has no name or no type"));
@@ -325,7 +325,7 @@ impl Array {
         Array::new((name, kind), components, grid, None)
     }
 
-    /// `name components tuples type`, a line of FIELD.
+    /// Parses a line of FIELD: `name components tuples type`.
     fn field(line: &str, grid: &Grid) -> Result<Array, Problem> {
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         if let [name, components, tuples, kind] = words[..]
@@ -336,7 +336,7 @@ impl Array {
         Err(bad("FIELD", format!("{} is no array", quoted(line))))
     }
 
-    /// An array of several numbers a point, by its keyword.
+    /// Parses the words of a keyword whose array has several numbers a point.
     fn other(key: &str, words: &[&str], text: bool, grid: &Grid) -> Result<Array, Problem> {
         let third = || words.get(2).and_then(|n| n.parse().ok());
         let (components, kind) = match key {
@@ -350,7 +350,7 @@ impl Array {
             return Err(bad(key, "has no name, size or type"));
         };
         let mut array = Array::new((name, kind), components, grid, None)?;
-        // VTK calls colours what has one byte a point, too.
+        // VTK also writes one byte a point as COLOR_SCALARS.
         match key == "COLOR_SCALARS" && components == 1 {
             true => array.shares = text,
             false => array.number = None,
@@ -364,7 +364,7 @@ impl Array {
     }
 }
 
-/// Returns a name as people know it: VTK writes a blank as `%20`.
+/// Decodes percent encoding in a name: VTK writes a blank as `%20`.
 fn decoded(name: &str) -> String {
     let mut out = Vec::new();
     let mut rest = name.as_bytes();
@@ -379,7 +379,7 @@ fn decoded(name: &str) -> String {
     String::from_utf8_lossy(&out).into_owned()
 }
 
-/// The lines of a file, and what stands between them.
+/// Reader of a file's lines, and of the arrays between them.
 struct Lines {
     inner: Box<dyn BufRead + Send>,
     consumed: u64,
@@ -472,7 +472,7 @@ pub(crate) mod tests {
     use super::*;
     use std::path::Path;
 
-    /// A file of 4 x 3 x 2 points with the arrays `first` (vectors), `second` and `third`.
+    /// Returns a file of 4 x 3 x 2 points with the arrays `first` (vectors), `second` and `third`.
     pub(crate) fn vtk(text: bool, kind: &str, field: bool) -> Vec<u8> {
         let mut out = format!(
             "# vtk DataFile Version 3.0\na title\n{}\nDATASET STRUCTURED_POINTS\nDIMENSIONS 4 3 2\n\

@@ -35,7 +35,7 @@ pub(crate) fn compact_integers<T: Wide + Ord + Into<i128>>(
         if exact {
             return Ok((Samples::U16(convert(pieces, code)?), map));
         }
-        // How far f64s lie apart there.
+        // Half the distance of neighbouring f64s at these sizes, at least 1.
         beside.rounded::<T>((min.abs().max(max.abs()) as f64 * f64::EPSILON / 2.0).max(1.0));
         return Ok((Samples::U16(convert_beside(pieces, map, beside, code)?), map));
     }
@@ -69,9 +69,9 @@ pub(crate) fn unit_code(v: i128, min: i128, span: i128) -> f32 {
 
 const F32_MAX: f64 = f32::MAX as f64;
 
-/// Least size of a filler, and how many times it is as large as all other values. Fillers in use are
-/// 1e20, 1e30, 9.97e36 (NetCDF), 3.4e38 and 1.8e308; a hot voxel of an image is smaller. Beside a
-/// factor of 1e9 the others would be one step of f32 (2^24), and pictures show nothing of them.
+/// Least size of a filler, and how many times it is as large as all other values. Fillers in use
+/// are 1e20, 1e30, 9.97e36 (NetCDF), 3.4e38 and 1.8e308; a hot voxel of an image is smaller. Beside
+/// a factor of 1e9 the others would be one step of f32 (2^24), and pictures show nothing of them.
 const FILLER_MIN: f64 = 1e15;
 const FILLER_RATIO: f64 = 1e9;
 /// Least number of values that tell a filler from a value like others.
@@ -168,7 +168,8 @@ pub(crate) fn compact_doubles(
     Ok((Samples::F32(codes), map))
 }
 
-/// Returns the map from f32 codes to doubles from `lo` to `hi`; `lo` is above `hi` if there are none.
+/// Returns the map from f32 codes to doubles from `lo` to `hi`; `lo` is above `hi` if there are
+/// none.
 pub(crate) fn double_map(lo: f64, hi: f64) -> ValueMap {
     if lo > hi || f32_keeps_range(lo, hi) {
         ValueMap::IDENTITY

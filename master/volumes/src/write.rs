@@ -1,9 +1,9 @@
 //! Writes volumes as NRRD and NIfTI-1.
 //!
-//! Samples are written in a type that holds their values exactly, the lattice in RAS+: the file's own
-//! numbers where the volume's codes round them ([`FileNumbers`]). NIfTI has a slope and an intercept;
-//! NRRD has none, so values that are no whole numbers become floats there. Voxels with colours of their
-//! own are written as colours.
+//! Samples are written in a type that holds their values exactly; if the volume's codes round the
+//! file's own numbers, these are written ([`FileNumbers`]). The lattice is in RAS+. NIfTI has a
+//! slope and an intercept. NRRD has neither, so values that are not whole numbers become floats
+//! there. Voxels with colours of their own are written as colours.
 
 use crate::numbers::FileNumbers;
 use crate::samples::Number;
@@ -56,7 +56,8 @@ impl Format {
 /// Samples between two calls of `on_progress`: some ms.
 const STEP_SAMPLES: usize = 1 << 16;
 
-/// Writes a volume to `out`, with the file's own `numbers` in place of the samples if there are any.
+/// Writes a volume to `out`, with the file's own `numbers` in place of the samples if there are
+/// any.
 ///
 /// `on_progress` is called after each part with the number of samples written so far.
 ///
@@ -132,14 +133,14 @@ pub fn type_note(volume: &Volume, numbers: Option<&FileNumbers>, format: Format)
     Some(format!("the file has {from}, and {to} is written, {why}"))
 }
 
-/// How the file's own numbers are written.
+/// Form in which the file's own numbers are written.
 #[derive(Clone, Copy, PartialEq)]
 enum Own {
     Numbers,
     Values,
 }
 
-/// How samples are written: their type, and the maps from code to number and number to value.
+/// Form of written samples: their type, and the maps from code to number and from number to value.
 struct NumberForm {
     number: Number,
     /// Whether the file's own numbers are written: as they are, or as values.

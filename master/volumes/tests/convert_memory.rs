@@ -1,5 +1,4 @@
-//! Tests that a volume is converted in the memory that the planes of its levels take, and not in that of
-//! the volume.
+//! Tests that a conversion takes the memory of some planes of each level, and not of the volume.
 //!
 //! A test program of its own, since it measures the peak memory of the process.
 #![cfg(all(feature = "zarr", target_os = "linux"))]

@@ -159,7 +159,7 @@ fn refusal_does_not_tell_whether_a_file_outside_exists() {
         link(&not);
         assert_eq!(ask("link.raw"), found, "{there} and {not} behind a link");
         assert_eq!(found, missing);
-        // Of several files, in a list.
+        // A file of a list is missing.
         for name in [there, not] {
             let list = format!("{HEADER}data file: LIST\n{name}\n{name}\n");
             std::fs::write(&header, list).unwrap();
@@ -199,7 +199,7 @@ fn small_file_that_says_it_is_large_asks_before_it_is_inflated() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("honest.nrrd");
     let header = "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 2048 2048 2048\nencoding: gzip\n\n";
-    // As many bytes as 8 GiB of zeros need; nobody looks at them before the size is allowed.
+    // 8 GiB of zeros need about so many bytes; they are not read before the size is allowed.
     let data = vec![0u8; 9 << 20];
     std::fs::write(&path, [header.as_bytes(), &data].concat()).unwrap();
     let (kind, line) = refusal(&path);
@@ -263,7 +263,7 @@ fn small_files_with_large_sizes_take_neither_memory_nor_time() {
         let (_, line) = refusal(&path);
         assert!(line.contains(say), "want {say:?} in {line}");
     }
-    // As a skip inside gzip the bytes are dropped as they arrive, up to a limit.
+    // A skip inside gzip drops bytes as they are decoded, up to a limit.
     let skip = format!("{}byte skip: 16000000\n\n", HEADER.replace("raw", "gzip"));
     std::fs::write(&path, [skip.as_bytes(), &bomb].concat()).unwrap();
     assert!(refusal(&path).1.contains("goes on after the 24 bytes"));

@@ -148,7 +148,7 @@ fn sample_volume_is_upright_and_not_mirrored() {
     assert!(v.anatomical, "it says where right, anterior and superior are");
     assert_eq!(v.lattice.steps, [DVec3::X, DVec3::Y, DVec3::Z]);
     assert_eq!(v.lattice.origin, DVec3::new(-98.0, -134.0, -72.0));
-    // What its README says: brain from 20 on 21.8 %.
+    // Its README says that 21.8 % of the samples are brain, from value 20 on.
     let brain = v.summary.histogram[20..].iter().sum::<u64>() as f64 / v.lattice.len() as f64;
     assert!((brain - 0.218).abs() < 1e-3, "{brain}");
     // In anatomy: the top of the brain (vertex) is at z of some 80 mm above the anterior

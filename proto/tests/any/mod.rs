@@ -160,7 +160,7 @@ pub fn result() -> impl Strategy<Value = TileResult> {
             |((task, epoch), (a, last), colour, c, (thread, region))| TileResult {
                 task: TaskId(task),
                 epoch: Epoch(epoch),
-                // What a message says of itself, nobody writes.
+                // The reader of a message sets its size; it is not written.
                 bytes: None,
                 pixels: match c[6] % 2 {
                     0 => Pixels::Sums(TilePixels { a, colour, last }),

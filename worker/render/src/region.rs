@@ -46,7 +46,7 @@ struct DrawContext<'a> {
     ahead: u32,
 }
 
-/// How far a part was drawn.
+/// Progress of drawing a part.
 struct PartProgress {
     /// The sheet before which it stopped; `None` if it was drawn to its end.
     stop: Option<i32>,
@@ -143,7 +143,7 @@ pub struct Region {
     counters: Counters,
     /// Directory indices of bricks that were drawn, with repetitions.
     touched: Vec<u32>,
-    /// Of parts at their end: the sheets at which their cells were shut.
+    /// Sheets at which the cells of finished parts were shut.
     depths: Vec<(Rect, Cells)>,
 }
 

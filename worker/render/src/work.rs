@@ -1,9 +1,10 @@
 //! The work of each pixel of a tile, counted while it is drawn and from its voxels.
 //!
-//! Sheets are counted where they close. Sections are not counted where they are added, in the innermost
-//! loops: a pixel gets all sections of the voxels that cover it up to the sheet in which it was shut, and
-//! that follows from their places and from that sheet alone. So voxels are walked through once more,
-//! without their looks, and those behind shut pixels are passed over, first by block and brick.
+//! Sheets are counted where they close. Sections are not counted where they are added, in the
+//! innermost loops: a pixel gets all sections of the voxels that cover it up to the sheet in which
+//! it was shut, and that follows from their places and from that sheet alone. So voxels are walked
+//! through once more, without their looks, and those behind shut pixels are passed over, first by
+//! block and brick.
 //!
 //! [`crate::oracle::work_counters`] gets the same numbers as it draws plainly.
 
@@ -20,8 +21,8 @@ use slabcast_common::occlusion::Rect;
 use slabcast_common::region::{PART_EDGE, parts};
 use slabcast_common::view::Projection;
 
-/// Draws `tile` as [`region::draw`] does and returns the work of its pixels, that of the sections only
-/// if `sections` are asked for.
+/// Draws `tile` as [`region::draw`] does and returns the work of its pixels. Sections are counted
+/// only if `sections` is set.
 ///
 /// # Panics
 /// If `supply` lacks a brick that the tile needs.
@@ -53,7 +54,8 @@ const EDGE: usize = PART_EDGE as usize;
 const CELL: usize = 8;
 const CELLS: usize = EDGE / CELL;
 
-/// The sheet before which each pixel of a part ends: the one behind that in which it was shut, or none.
+/// The sheet before which each pixel of a part ends: the one behind that in which it was shut, or
+/// none.
 struct Ends {
     part: Rect,
     /// In rows of [`EDGE`].

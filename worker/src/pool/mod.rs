@@ -4,9 +4,9 @@
 //! Clients take turns: the one that had least time of the threads comes next, and a region that
 //! takes long gives way between two sheets. A client's tasks are in the order of frames, since a
 //! late frame holds up those behind it; in a frame, a region that goes on comes before one that
-//! begins. Before a thread draws a task it looks at the
-//! regions that came into the queue meanwhile: bricks that they will need, judged by earlier
-//! frames, are asked for at once and travel while other tasks are drawn (prefetch).
+//! begins. Before a thread draws a task, it looks at the regions that came into the queue
+//! meanwhile: bricks that they will need, judged by earlier frames, are asked for at once and
+//! travel while other tasks are drawn (prefetch).
 
 mod draw;
 mod queue;

@@ -304,7 +304,7 @@ async fn lookahead_grows_while_render_threads_wait_for_bricks() {
         world.send(asked[0]).await;
     }
     assert_eq!(world.result().await.region.map(|cost| cost.stalls), Some(2));
-    // Of another tile nothing is expected, and it waits longer than a fiftieth of the time.
+    // No bricks are expected for another tile, and it waits longer than a fiftieth of the time.
     for tile in [Rect::new(0, 16, 16, 32), Rect::new(16, 16, 32, 32)] {
         let drop = ToWorker::DropBricks { set: SET, bricks: vec![BrickId(0), BrickId(1)] };
         world.bricks.send(Bricks::Message(drop)).await.unwrap();
@@ -363,7 +363,7 @@ async fn work_stealing_piece_of_a_region_resumes_with_the_same_pixels() {
         let (frame, task, epoch) = (FRAME, TaskId(task), Epoch(epoch));
         ToWorker::SplitRegion { frame, task, epoch, share: 500 }
     };
-    // Of what it does not have, or not so, it gives nothing.
+    // It gives nothing away for a task, or a state of it, that it does not have.
     world.say(split(1, 1));
     world.say(split(2, 0));
     world.settle().await;
@@ -391,7 +391,7 @@ async fn work_stealing_piece_of_a_region_resumes_with_the_same_pixels() {
     for (part, rect) in [(kept, piece.kept), (given, piece.given)] {
         assert_eq!(*sums(&part), sums(&whole).crop(tile, rect), "as if it had never moved");
     }
-    // What can't have been begun so is refused.
+    // A state that the tile can't have is refused.
     world.say(lease(4, tile, Some(Arc::new(piece.begun.clone()))));
     let ToMaster::Failed { reason, .. } = world.hear().await else { panic!("refused") };
     assert!(reason.contains("tile's size"), "{reason}");
@@ -543,7 +543,7 @@ async fn region_of_a_client_is_drawn_beside_a_long_one_of_another_with_the_same_
     world.settle().await;
     let mut before = 0;
     let beside = loop {
-        // Of another client's frame.
+        // Regions of another client's frame.
         world.region_of(FRAME, 10 + before, Rect::new(0, 0, 32, 32));
         let result = world.result().await;
         if result.task == TaskId(2) {

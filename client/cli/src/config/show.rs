@@ -61,7 +61,8 @@ pub(crate) fn run(
     understand: impl Fn(&clap::Error) -> Fail,
 ) -> Result<(), Fail> {
     let What::Show { json, line } = &args.what;
-    // What follows the command is the command's; but who types --json last means it.
+    // Flags after the command belong to it, except --json at the very end, which is meant for
+    // `show`.
     let last = line.last().is_some_and(|l| l == "--json");
     let (json, line) = if last { (true, &line[..line.len() - 1]) } else { (*json, &line[..]) };
     let mut all = Vec::new();

@@ -266,15 +266,15 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     result
 }
 
-/// Returns whether VOLUME means a file, a folder or a formula of this machine, and not a volume of the
-/// master by name. Names have no `/`, so a path to a missing file is reported as one.
+/// Returns whether VOLUME means a file, a folder or a formula of this machine, and not a volume of
+/// the master by name. Names have no `/`, so a path to a missing file is reported as one.
 fn is_here(volume: &Path) -> bool {
     let text = volume.to_string_lossy();
     volume.exists() || text.contains('/') || text.starts_with("formula:")
 }
 
-/// Returns the volume at the master that the command means. A file is read here, and put there unless
-/// the master has it.
+/// Returns the volume at the master that the command means. A file is read here, and put there
+/// unless the master has it.
 fn served(
     args: &RenderArgs,
     run: &mut Run,
@@ -292,7 +292,7 @@ fn served(
     let volume = args.input.open(volume)?;
     let orientation = args.scene.view.axes.for_volume(&volume)?;
     let name = (volume.name.as_str(), false);
-    // Of what the master has, not a byte is sent and nothing said.
+    // Nothing is sent and no progress is shown if the master has the volume already.
     let mut sending = None;
     let told = |there, total| {
         if there < total || sending.is_some() {
@@ -313,8 +313,8 @@ fn served(
     put
 }
 
-/// The turn that is drawn where no flag says it: a full one in a folder, its first picture in a file
-/// of one, and a smooth one in a video.
+/// The turn that is drawn where no flag says it: a full one in a folder, its first picture in a
+/// file of one, and a smooth one in a video.
 fn usual_turn(args: &RenderArgs) -> Result<UsualTurn, Fail> {
     let asked = args.output.asked()?;
     let usual = if args.output.is_one_picture()? && args.turn.or(args.seconds).is_none() {

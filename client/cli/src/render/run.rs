@@ -44,8 +44,8 @@ pub(super) struct Run {
     pub(super) tell: bool,
 }
 
-/// Fields of view from which on people lose sight of where the eye is: at 60 degrees it is 0.87 times
-/// the picture's height away from the target.
+/// Fields of view from which on people lose sight of where the eye is: at 60 degrees it is 0.87
+/// times the picture's height away from the target.
 const WIDE: f64 = 60.0;
 
 /// Says where the eye is if a wide field of view takes it near to the volume or into it.
@@ -118,7 +118,7 @@ impl Run {
         let as_what = (self.output.format, self.output.fps());
         let figure = &self.output.figure;
         let recipe = RunProvenance::new(&self.request, info, orientation, as_what, figure)?;
-        // What the marks lack is said before any work.
+        // Errors of marks are reported before any work.
         self.marker(recipe.path().clone(), info, orientation)?;
         self.output.make()?;
         if self.tell
@@ -244,8 +244,8 @@ impl Run {
             patience.give_up();
             source.cancel.now().await;
         }
-        // What is being encoded is whole in a moment: it is kept. Who reads a pipe may have
-        // stopped, though.
+        // The frame that is being encoded is kept, since it is complete in a moment. But the reader
+        // of a pipe may have stopped, so there is a limit.
         let patient = if ended.is_err() { LAST } else { Duration::MAX };
         let drained = match tokio::time::timeout(patient, writer.end()).await {
             Ok(drained) => drained,

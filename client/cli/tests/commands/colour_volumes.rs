@@ -3,7 +3,7 @@
 use crate::program::{good, master, run, text, worker};
 use std::path::Path;
 
-/// A ball of 24 voxels in eight colours, in black.
+/// Returns the colour of voxel `at` of a ball of 24 voxels in eight colours, in black.
 fn ball(at: [u32; 3]) -> [u8; 3] {
     let d = at.map(|x| f64::from(x) - 11.5);
     if d.iter().map(|x| x * x).sum::<f64>() > 100.0 {

@@ -39,7 +39,7 @@ fn convergence_prints_orders_and_writes_figures() {
         }
         // Rounded positions hide more than they show below that in so small a picture.
         assert!((1.7..2.3).contains(&order(sweep, 1, "constant_f64")));
-        // What a rendered picture is off by is thickness and roundings, and no third thing.
+        // The error of a rendered picture is the sum of thickness and roundings, and nothing else.
         let parts: f64 =
             ["linear_f64", "positions", "f32", "integers"].iter().map(|p| rmse(sweep, 1, p)).sum();
         assert!(rmse(sweep, 1, "linear") <= 1.001 * parts, "{parts}");

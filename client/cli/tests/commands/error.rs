@@ -112,7 +112,7 @@ fn error_map_shows_where_the_error_is() {
     let text: Vec<_> = info.uncompressed_latin1_text.iter().map(|t| &t.text[..]).collect();
     assert!(text.iter().any(|t| t.contains("of 1/255 or less")), "{text:?}");
     let at = |x: usize, y: usize| &bytes[(y * w + x) * 3..][..3];
-    // As many coloured pixels as were compared, and where the picture shows something.
+    // The map has as many coloured pixels as were compared, all where the picture shows something.
     let blank = |x: usize, y: usize| at(96 + 8 + x, y) == [96; 3];
     let all = (0..80).flat_map(|y| (0..96).map(move |x| (x, y)));
     let seen = all.clone().filter(|&(x, y)| !blank(x, y)).count();

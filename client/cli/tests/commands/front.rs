@@ -66,7 +66,7 @@ fn report_writes_all_files_and_marks_front_and_default() {
         let info = png::Decoder::new(std::io::Cursor::new(&png)).read_info().unwrap();
         assert_eq!((info.info().width, info.info().height), (2160, 1400));
     }
-    // What is there stays, unless --force.
+    // Existing files stay, unless --force is given.
     let again = run(dir.path(), &[&["lab", "report"], &SCENE, &only, &["-o", "r"]]);
     assert_eq!(again.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&again.stderr).contains("--force"));
@@ -233,7 +233,7 @@ fn statistics_contain_error_estimates_by_source() {
                 let Some(bound) = said[name]["bound"].as_f64() else { continue };
                 let found = judged[found]["max"].as_f64().unwrap();
                 println!("{tf} {thickness} {azimuth} {name}: {found} of at most {bound}");
-                // What is found of integers is found with floats, which round, too.
+                // The integers' error is measured with floats, which round, too.
                 assert!(found <= bound + 1e-4, "{name}: {found} of at most {bound}");
                 bounded += 1;
             }

@@ -1,4 +1,5 @@
-//! How the program behaves when all is well: what goes where, what is left, how it stops.
+//! Behaviour of the program without errors: where its output goes, which files it leaves, and how
+//! it stops.
 
 use crate::program::{Process, end, master, names, run, signal, slabcast, text, wait_until};
 use slabcast_common::stats::FrameStats;

@@ -57,7 +57,7 @@ fn plan_separates_measured_from_predicted() {
         assert!(row["render_threads"].is_null() && row["master_busy"].is_null(), "{row}");
         assert!(row["frames_per_s"].is_null() && row["throughput_efficiency"].is_null(), "{row}");
     }
-    // What was measured is read again; a slow link then binds.
+    // The saved measurements are read again; with a slow link, the link is the bound.
     let slow = [
         "--workers",
         "8",

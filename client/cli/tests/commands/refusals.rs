@@ -569,7 +569,7 @@ fn bad_variables_are_named() {
         assert_eq!((out.status.code(), said.lines().count()), (Some(2), 1), "{name}: {said}");
         assert!(names.iter().all(|n| said.contains(n)), "{name}: {said}");
     }
-    // What only looks like one of ours is mentioned, and no more.
+    // A variable that only looks like one of slabcast's is mentioned, and the command succeeds.
     let line = ["render", "formula:one", "--azimuth", "0", "--size", "8x8", "-o", "a.png", "-q"];
     let out = slabcast(dir.path(), &line).env("SLABCAST_THREDS", "2").output().unwrap();
     let said = String::from_utf8_lossy(&out.stderr);

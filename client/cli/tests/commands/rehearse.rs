@@ -52,7 +52,7 @@ fn rehearsal_uses_the_given_address() {
     assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
     assert!(said.contains(&format!("over the link of {at}")), "{said}");
 
-    // What workers can't be started by is named, and nobody waits for them.
+    // The program that can't start workers is named at once, without waiting for workers.
     let out = plan(&["--rehearse-at", at, "--rehearse-by", "no-such-program far"]);
     assert_eq!(out.status.code(), Some(1));
     let said = text(&out.stderr);

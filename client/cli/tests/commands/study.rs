@@ -135,7 +135,7 @@ fn study_tables_and_charts_agree() {
     for origin in ["measured", "predicted", "paper"] {
         assert!(page.contains(&format!("<td>{origin}</td>")) || page.contains(origin), "{origin}");
     }
-    // Of nothing there is none, and no folder of it.
+    // Without anything visible there is no study, and no folder.
     let nothing = ["lab", "study", name, "-o", "none", "--quick", "--crop", "0%:1%,0%:1%,0%:1%"];
     let out = run(dir, &[&nothing[..], &SMALL[..2]].concat());
     let said = text(&out.stderr);

@@ -47,7 +47,7 @@ fn rerender_gives_the_same_file_bytes() {
         assert_eq!(read(&again), read(Path::new(picture)), "{name}");
         assert!(read(&again).len() > 200, "{name}");
     }
-    // What it says of itself is JSON and names no file.
+    // The recipe in the picture is JSON and names no file.
     let said = good(dir, &["rerender", "deep/frame_0000.png", "--show"]);
     let json: serde_json::Value = serde_json::from_str(&said).unwrap();
     assert_eq!(json["pixels_version"], slabcast_common::PIXELS_VERSION);
@@ -109,7 +109,7 @@ fn rerender_tells_missing_provenance_from_changed_pixels() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     render(dir, &["--azimuth", "0", "-o", "a.png"]);
-    // The same picture, saved by a program that drops text.
+    // A copy of the picture, saved by a program that drops text.
     let decode = |path: &Path| {
         let file = std::io::BufReader::new(std::fs::File::open(path).unwrap());
         let mut png = png::Decoder::new(file).read_info().unwrap();

@@ -11,7 +11,8 @@ use std::process::Command;
 fn thin(volume: &str, look: &[&str]) {
     let views = [
         &["--projection", "ortho"][..],
-        // The same window of a picture with a field of view of 30 degrees, 320 vox high.
+        // A window of the same size, out of a picture 320 vox high with a field of view of 30
+        // degrees.
         &["--projection", "persp", "--fov", "1.4391"],
     ];
     for view in views {

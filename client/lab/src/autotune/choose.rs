@@ -28,8 +28,8 @@ use std::time::Instant;
 
 /// Least ratio of the promised RMSE to the measured one.
 const RMSE_MARGIN: f64 = 1.2;
-/// Least ratio of the promised error of 99.9 % of the pixels to the measured one. Of 3072 pixels
-/// about a third are not blank, so the second worst of these decides.
+/// Least ratio of the promised error of 99.9 % of the pixels to the measured one. About a third of
+/// the 3072 pixels are not blank, so the second worst of these decides.
 const MAX_ERROR_MARGIN: f64 = 1.5;
 /// Least ratio of the budget to the measured frame time. A few frames stand for all, and the runs
 /// of one machine differ.
@@ -63,9 +63,9 @@ pub struct Chosen {
 
 /// Returns the settings to try for pictures of `size` pixels, from fast to exact.
 ///
-/// Taken from the Pareto fronts of `slabcast lab report` (docs/measurements/accuracy.md): 16-bit
-/// sums with eps falling as sheets become thin, then 32-bit sums where 16 bits round too much. 16
-/// bits are tried only where a sheet fits them.
+/// They come from the Pareto fronts of `slabcast lab report` (docs/measurements/accuracy.md):
+/// 16-bit sums with eps falling as sheets become thin, then 32-bit sums where 16 bits round too
+/// much. 16 bits are tried only where a sheet fits them.
 pub(super) fn ladder(base: &Setting, size: [u32; 2]) -> Vec<Setting> {
     let b = base.quality;
     let short = b.fits_i16();
@@ -339,12 +339,14 @@ pub(crate) fn settle(
     Ok(())
 }
 
-/// Tries `auto` from its own level to finer ones, until the target is kept at one, and leaves that
-/// level in the request. Another choice of the level stands. `coarsest`: the level that `auto` means;
-/// `None` where only the master knows, so that `auto` and level 0 are tried.
+/// Calls `choose` with the request at one level of detail after another, from coarse to fine, until
+/// a level keeps the target; returns what `choose` returned there. The request keeps that level.
+///
+/// Only a request for `--level auto` tries several: from `coarsest`, the level that `auto` means,
+/// to level 0. Without `coarsest` (only the master knows it) it tries `auto`, then level 0.
 ///
 /// # Errors
-/// Those of `choose` at the finest level, and any that is not about the target.
+/// `choose` failed at level 0, or failed at another level for a reason that is not the target.
 pub fn at_level_that_keeps_target<T>(
     request: &mut RenderRequest,
     coarsest: Option<u32>,

@@ -79,7 +79,7 @@ fn shot(
     let volume = volume::open(Path::new(name))?;
     let dims = volume.lattice.dims;
     let centre = dims.map(|n| (f64::from(n) - 1.0) / 2.0);
-    // What lies across: all but the axis that is looked along, if it is one.
+    // Largest side across the view; the axis that is looked along, if any, does not count.
     let across = (0..3).filter(|&a| to_eye[a] != 1.0).map(|a| dims[a]).max().unwrap_or(1);
     let n = (f64::from(across + 8) * scale) as u32;
     Ok(Shot {
@@ -216,7 +216,7 @@ fn two_walls(front: f64, back: f64) -> Case {
         let shot = shot("formula:two-walls:48", tf, Quality::before(), [0.0, 1.0, 0.0], 4.0)?;
         let ready = shot.ready()?;
         let picture = ready.picture(Cut::on(tools.threads));
-        // What the formula says, read along its middle, from the eye's side.
+        // Layers of the formula along the volume's middle line, from the eye's side.
         let [nx, ny, nz] = shot.volume.lattice.dims.map(|n| n as usize);
         let code = |j: usize| shot.volume.samples.code(nx / 2 + nx * (j + ny * (nz / 2)));
         let layers = (0..ny).rev().map(|j| match code(j) {

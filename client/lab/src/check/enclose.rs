@@ -9,8 +9,8 @@
 //! whatever the roundings are. It is not tight: it assumes that all roundings have the same sign,
 //! while in truth they scatter.
 //!
-//! Where an edge of the volume is stiff, the bound is wide because the picture is: half a
-//! subpixel beside an edge of extinction 1e9, a pixel may be anything.
+//! At a stiff edge of the volume the bound is wide because the picture is sensitive: half a
+//! subpixel beside an edge of extinction 1e9, a pixel may have any value.
 
 use super::shot::PreparedShot;
 use slabcast_common::bounds::i32_units_per_payload;
@@ -180,8 +180,8 @@ impl<'a> Enclosure<'a> {
                 let end = libm::ceil((eye.z + dz + radius) / d) as i32;
                 let place = |k: i32| {
                     let scale = view.scale_at(k)?;
-                    // Where the kernel leans, its section is beside its voxel, and its row beside
-                    // that.
+                    // A leaning kernel has its section beside its voxel, and its row beside its
+                    // section.
                     let Lean { depth: [lean_x, lean_y], row } = view.kernel_lean;
                     let from = f64::from(k) * d - eye.z;
                     let behind = self.kernel[2].placed(from, from + d);
@@ -197,8 +197,7 @@ impl<'a> Enclosure<'a> {
                     let gy = across(&self.kernel[1], py, at_y, scale, off_y);
                     (gx.hi > 0.0 && gy.hi > 0.0).then(|| gx.times(gy))
                 };
-                // Where rays are parallel and the kernel does not lean the place is the same in all
-                // sheets.
+                // With parallel rays and an upright kernel, the place is the same in all sheets.
                 let parallel = matches!(view.projection, Projection::Ortho { .. })
                     && view.kernel_lean.is_none();
                 let same = if parallel { place(f_lo) } else { None };
@@ -264,7 +263,7 @@ impl<'a> Enclosure<'a> {
         sums.map(|s| {
             let lo = s.lo * (1.0 - relative) - n * self.half_unit;
             let hi = s.hi * (1.0 + relative) + n * self.half_unit;
-            // What is as faint as this may be taken for nothing.
+            // A contribution below FAINTEST may be rounded to zero.
             let lo = if self.floats && lo < 2.0 * FAINTEST { 0.0 } else { lo.max(0.0) };
             let hi = if self.floats && hi < 0.5 * FAINTEST { 0.0 } else { hi };
             Span::new(lo * secant, hi * secant)
@@ -296,7 +295,7 @@ impl<'a> Enclosure<'a> {
         let q = &self.ready.spec.quality;
         let none = Sheet::default();
         let (mut a, mut light) = (Span::default(), [Span::default(); 3]);
-        // As the pixel would stand if it was shut as early as it may be.
+        // The pixel's value if it is shut as early as possible.
         let mut shut: Option<[f64; 4]> = None;
         let mut before: Option<(usize, CompositedSheet)> = None;
         let touched = sheets.iter().enumerate().filter(|(_, s)| s.count > 0);

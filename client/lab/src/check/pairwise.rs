@@ -71,7 +71,7 @@ mod tests {
         let rows = rows(&levels, &shared);
         let combinations: std::collections::BTreeSet<_> =
             rows.iter().map(|r| shared.map(|i| r[i])).collect();
-        // As few as four workers on three links make.
+        // The 24 rows take no more combinations than four workers on three links have alone.
         assert_eq!((rows.len(), combinations.len()), (24, 12));
     }
 }

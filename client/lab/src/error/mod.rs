@@ -164,8 +164,9 @@ fn measure(args: &ErrorArgs) -> Result<ErrorResult, Fail> {
     Ok(result)
 }
 
-/// Adds the error of a coarser level, of which all else was measured: its limit against that of level
-/// 0, which is the truth from here on.
+/// Adds the error of a coarser level to a result that was measured against the level's own limit.
+/// The error is the difference of the limits of the level and of level 0; the latter becomes the
+/// truth.
 fn add_level(result: &mut ErrorResult, detailed: &SingleFrame, threads: usize) {
     let mut progress = Progress::new(false).counting("pixel");
     let pixels = format!("{} pixels of level 0", result.sample.len());

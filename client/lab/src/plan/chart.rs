@@ -191,8 +191,7 @@ mod tests {
 
     #[test]
     fn strip_of_bounds_has_no_gaps_and_labels_that_fit() {
-        // As the link and the master bind by turns where clusters are large and close to each
-        // other.
+        // Link and master bind by turns, as they do where large clusters have nearly equal times.
         let bound = |n: u32| {
             if n < 20 { Bound::Cores } else { [Bound::Link, Bound::Master][(n % 2) as usize] }
         };

@@ -213,7 +213,7 @@ impl Bench {
         let (setup_ns, frame) = shortest(self.repeats, || Frame::new(scene.clone(), job.view));
         let looked = self.look(path, &frame);
         let (alone_edge, alone_ns) = self.alone(path, &frame, &looked);
-        // As the schedule does (`schedule::state::frame`).
+        // This follows the schedule (`schedule::state::frame`).
         let projected: Vec<Option<Projected>> =
             job.bricks.iter().map(|b| job.view.project(&b.tight)).collect();
         let regions = self.regions(path, job, &frame, &projected);
@@ -267,7 +267,7 @@ impl Bench {
         shut: &ShutMap,
     ) -> (Vec<Level>, Vec<(Rect, TilePixels)>) {
         let cull = job.scene.quality.cull;
-        // As the schedule does (`schedule::state::frame`).
+        // This follows the schedule (`schedule::state::frame`).
         let (mut needed, mut rects) = (Vec::new(), Vec::new());
         for (i, p) in projected.iter().enumerate() {
             let Some(p) = p.filter(|p| p.sheets.overlaps(range)) else { continue };

@@ -7,7 +7,8 @@ pub(super) fn round_below(most: f64) -> f64 {
     [10.0, 5.0, 2.0, 1.0].map(|n| n * ten).into_iter().find(|n| *n <= most).unwrap_or(ten)
 }
 
-/// A number as short as it can be read again, without the noise of its last digits.
+/// Formats a number with the fewest digits that read back to it, without the noise of its last
+/// digits.
 pub(super) fn number(x: f64) -> String {
     let short = format!("{x:.3e}").parse::<f64>().unwrap_or(x);
     let size = short.abs();
@@ -19,7 +20,7 @@ pub(super) fn number(x: f64) -> String {
     .replace('-', "\u{2212}")
 }
 
-/// A length in mm in the prefix that suits it.
+/// Formats a length in mm with the prefix that suits it.
 pub(super) fn millimetres(mm: f64) -> String {
     let (scale, unit) = match mm {
         _ if mm >= 9e5 => (1e-6, "km"),

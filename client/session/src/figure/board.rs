@@ -77,12 +77,12 @@ impl Board {
         self.bytes
     }
 
-    /// Size of text in pixels.
+    /// Returns the size of text in pixels.
     pub(super) fn em(&self) -> f64 {
         self.em
     }
 
-    /// Width and height in pixels.
+    /// Returns the width and height in pixels.
     pub(super) fn size(&self) -> [f64; 2] {
         self.size.map(|n| n as f64)
     }

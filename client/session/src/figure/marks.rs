@@ -1,5 +1,5 @@
-//! Computes a frame's annotations: the length of its scale bar in mm and its orientation letters from
-//! the camera, its colour bar from the transfer function.
+//! Computes a frame's annotations: the length of its scale bar in mm and its orientation letters
+//! from the camera, its colour bar from the transfer function.
 
 use super::bar::{millimetres, number, round_below, ticks};
 use super::{Board, Figure, Place};
@@ -155,7 +155,8 @@ impl Marker {
         [wide, if lines > 0.0 { 1.3 * em * lines + 0.9 * em } else { 0.0 }].map(f64::ceil)
     }
 
-    /// Draws what a grid of views has once, at its right and below; `grid` is the size of all views.
+    /// Draws what a grid of views has once, at its right and below; `grid` is the size of all
+    /// views.
     pub fn draw_whole(&self, board: &mut Board, grid: [f64; 2]) {
         let [w, h] = board.size();
         let em = board.em();
@@ -230,7 +231,7 @@ fn sides(direction: DVec3) -> String {
     axes[..if second { 2 } else { 1 }].iter().map(|&axis| letter(axis)).collect()
 }
 
-/// The sides of the body at the edges of a picture.
+/// Returns the sides of the body at the edges of a picture.
 fn edges(camera: &Camera) -> [(Place, String); 4] {
     let ahead = -camera.to_eye.normalize();
     let right = ahead.cross(camera.up).normalize();
@@ -266,15 +267,15 @@ impl Colours {
         ticks(self.from, self.to).into_iter().map(|t| (t, number(t))).collect()
     }
 
-    /// Width of the bar with its numbers and opacities, in pixels.
+    /// Returns the width of the bar with its numbers and opacities, in pixels.
     fn width(&self, em: f64) -> f64 {
         let labels = self.labels();
         let text = labels.iter().map(|(_, l)| letters::width(l, em)).fold(0.0, f64::max);
         text + (0.6 + BAR + PROFILE) * em
     }
 
-    /// Draws the bar upright between two heights, with its numbers left of `right`, and beside it how
-    /// opacity goes.
+    /// Draws the bar upright between two heights, with its numbers left of `right`, and beside it
+    /// how opacity goes.
     fn draw(&self, board: &mut Board, right: f64, [top, bottom]: [f64; 2]) {
         let em = board.em();
         let labels = self.labels();

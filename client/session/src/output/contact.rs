@@ -23,7 +23,7 @@ const LINE: usize = 17;
 pub(crate) struct Names(Arc<Vec<Option<&'static str>>>);
 
 impl Names {
-    /// Of a path.
+    /// Returns the names of a path's sides; none if it has no sides.
     pub(crate) fn of(path: &ViewPath) -> Names {
         let last = path.first_frame() + path.frames();
         let names = (0..if path.has_sides() { last } else { 0 }).map(|n| path.side_name(n));

@@ -88,7 +88,7 @@ fn coding(format: Format, behind: [u8; 3]) -> Vec<String> {
     words.iter().map(|&word| word.into()).collect()
 }
 
-/// A background as sRGB bytes; black where there is none.
+/// Converts a background to sRGB bytes; without a background to black.
 pub(super) fn bytes_of(background: Background) -> [u8; 3] {
     match background {
         Background::Transparent => [0; 3],
@@ -140,7 +140,7 @@ impl Encoder {
         let mut stderr = child.stderr.take().expect("piped above");
         let said = std::thread::spawn(move || {
             let mut bytes = Vec::new();
-            // What can't be read is not said.
+            // A message that can't be read is left out.
             let _ = stderr.by_ref().take(1 << 16).read_to_end(&mut bytes);
             let _ = std::io::copy(&mut stderr, &mut std::io::sink());
             String::from_utf8_lossy(&bytes).into_owned()
@@ -192,7 +192,7 @@ impl Encoder {
 }
 
 impl Drop for Encoder {
-    /// Of a run that failed nothing stays: neither process nor file.
+    /// Ends the process and removes the file of a run that failed.
     fn drop(&mut self) {
         if self.file.is_some() {
             let _ = self.child.kill();

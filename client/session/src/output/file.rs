@@ -23,7 +23,7 @@ pub(super) fn hidden(folder: &Path, name: &str) -> Result<NamedTempFile> {
     let prefix = format!(".{name}.");
     builder.prefix(&prefix).suffix(".tmp");
     #[cfg(unix)]
-    // What the umask leaves, as for any file of the user's; the crate's own choice is 0600.
+    // The umask decides, as for any file of the user; the crate's own choice is 0600.
     builder.permissions(<Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666));
     builder.tempfile_in(folder)
 }
@@ -71,8 +71,9 @@ pub fn write_atomic(
     whole(path, fill).map_err(|e| Fail::io(path, "writing", &e))
 }
 
-/// Time between two attempts on a disk that takes nothing. A person who deletes something looks at the progress
-/// within a second or two; at a tenth of this, nothing is gained and logs of the file system fill.
+/// Time between two attempts on a disk that takes nothing. A person who deletes something looks at
+/// the progress within a second or two; at a tenth of this, nothing is gained and logs of the file
+/// system fill.
 const TRY_AGAIN: Duration = Duration::from_secs(1);
 
 /// Waits for a disk that takes nothing: full, or its folder gone or read-only. Warns once and tries
@@ -80,7 +81,8 @@ const TRY_AGAIN: Duration = Duration::from_secs(1);
 #[derive(Debug, Default)]
 pub struct DiskWait {
     given_up: AtomicBool,
-    /// Text of the note that ends the wait, such as "the folder is back"; `None` while no thread waits.
+    /// Text of the note that ends the wait, such as "the folder is back"; `None` while no thread
+    /// waits.
     waiting: Mutex<Option<&'static str>>,
 }
 

@@ -26,7 +26,8 @@ pub(crate) struct Folder {
 pub(crate) struct Wanted {
     /// Numbers of the frames.
     pub(crate) frames: Range<u64>,
-    /// Whether `frames` is a range of a longer path. Other frames of the path in the folder then stay.
+    /// Whether `frames` is a range of a longer path. Other frames of the path in the folder then
+    /// stay.
     pub(crate) part: bool,
     /// Stem and extension of the file names.
     pub(crate) names: (&'static str, &'static str),
@@ -188,8 +189,8 @@ impl Folder {
     }
 }
 
-/// Returns whether slabcast wrote a picture: the name stands at the beginning of its file, or at the
-/// end of a TIFF.
+/// Returns whether slabcast wrote a picture: the name stands at the beginning of its file, or at
+/// the end of a TIFF.
 fn is_of_slabcast(path: &Path) -> std::io::Result<bool> {
     const LOOK: u64 = 1 << 16;
     let mut file = std::fs::File::open(path)?;
@@ -269,7 +270,7 @@ mod tests {
             (folder.path.file_name().unwrap().to_str().unwrap().to_string(), note)
         };
         assert_eq!(look(false, false), ("out".into(), None));
-        // What is no frame is not in the way.
+        // Files that are not frames don't count.
         std::fs::create_dir(&own).unwrap();
         std::fs::write(own.join("notes.txt"), "").unwrap();
         assert_eq!(look(false, false), ("out".into(), None));

@@ -116,7 +116,7 @@ impl Format {
     }
 }
 
-/// Ending of a path's last part in lower case, without its dot.
+/// Returns the ending of a path's last part in lower case, without its dot.
 pub(super) fn ending(path: &Path) -> Option<String> {
     path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase)
 }
@@ -145,8 +145,8 @@ pub fn named(path: &Path) -> Result<Option<Format>, Fail> {
     Ok(format)
 }
 
-/// Returns a file's name if nothing has it, else the first free one of `NAME-2.png`, `NAME-3.png` and
-/// so on: for files that the user did not name.
+/// Returns a file's name if nothing has it, else the first free one of `NAME-2.png`, `NAME-3.png`
+/// and so on: for files that the user did not name.
 pub fn free_name(path: &Path) -> PathBuf {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     let ending = path.extension().unwrap_or_default();

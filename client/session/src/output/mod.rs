@@ -106,15 +106,16 @@ pub const OWN_FOLDER: &str = "slabcast-out/";
 pub struct OutputArgs {
     /// Folder for frame_0000.png and so on, or one file [default: slabcast-out/]
     ///
-    /// A folder is made if missing; beside a slabcast-out/ with pictures slabcast-out-2/ is, and so on.
-    /// NAME.png, .tif, .jpg or .exr is one picture: the first view, or a grid of the --views. NAME.mp4,
-    /// .webm and .gif (by ffmpeg), .apng or .y4m have all frames; - writes Y4M video to stdout.
+    /// A folder is made if missing; beside a slabcast-out/ with pictures slabcast-out-2/ is, and so
+    /// on. NAME.png, .tif, .jpg or .exr is one picture: the first view, or a grid of the --views.
+    /// NAME.mp4, .webm and .gif (by ffmpeg), .apng or .y4m have all frames; - writes Y4M video to
+    /// stdout.
     #[arg(short, long, value_name = "DIR|FILE|-")]
     pub output: Option<PathBuf>,
     /// png, png16, exr, tif, jpg, ... [default: by the name of -o]
     ///
-    /// png, png16, exr, tif, jpg, and moving: apng, y4m, mp4, webm, gif. png16 has 16 bits, exr linear
-    /// floats and no background. A folder gets png by default.
+    /// png, png16, exr, tif, jpg, and moving: apng, y4m, mp4, webm, gif. png16 has 16 bits, exr
+    /// linear floats and no background. A folder gets png by default.
     #[arg(long, value_name = "FORMAT", hide_possible_values = true, value_enum)]
     pub format: Option<Format>,
     /// Frames a second of a moving picture [default: 30 of mp4 and webm, else 12]
@@ -183,7 +184,7 @@ pub struct Output {
     /// Marks over the pictures, and their dots an inch.
     pub figure: Figure,
     background: Background,
-    /// How frames that arrive as small pictures of floats are magnified.
+    /// Magnification of frames that arrive as small pictures of floats; `None` for others.
     magnify: Option<Magnify>,
 }
 
@@ -636,7 +637,7 @@ pub fn write_picture(
     write(path, frame, &Inside { provenance: "", dpi }, format, &DiskWait::default())
 }
 
-/// Returns a background as sRGB bytes; black where there is none.
+/// Converts a background to sRGB bytes; without a background to black.
 pub fn background_bytes(background: Background) -> [u8; 3] {
     ffmpeg::bytes_of(background)
 }

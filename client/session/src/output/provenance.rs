@@ -119,9 +119,10 @@ impl Provenance {
         }
     }
 
-    /// Returns the provenance as JSON for a picture's file, or for that of a moving picture.
+    /// Returns the provenance as JSON for the file of a picture, still or moving. `frame` gives its
+    /// hash.
     pub(super) fn written(mut self, frame: &Frame) -> String {
-        // Of a single frame, that does not say it in another way.
+        // Only for a single frame without a hash of its linear pixels.
         if self.view_sha256.is_some() && self.pixels_sha256.is_none() {
             self.picture_sha256 = Some(Digest32(Sha256::digest(&frame.bytes).into()).to_string());
         }
@@ -328,7 +329,8 @@ impl RunProvenance {
         p
     }
 
-    /// Returns the provenance of all frames in one file, with level and sums as the master decided them.
+    /// Returns the provenance of all frames in one file, with level and sums as the master decided
+    /// them.
     pub fn movie(&self, stats: &FrameStats) -> Provenance {
         self.whole(stats)
     }

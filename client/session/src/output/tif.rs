@@ -58,7 +58,7 @@ fn write<C: ColorType<Inner = u8>>(
     image.write_data(&frame.bytes)
 }
 
-/// JSON in ASCII: other characters escaped, as a TIFF's text has no others.
+/// Escapes all characters of a JSON text that are not ASCII, since a TIFF's text has no others.
 fn ascii(json: &str) -> String {
     let mut text = String::with_capacity(json.len());
     let mut units = [0; 2];

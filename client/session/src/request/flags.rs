@@ -28,7 +28,7 @@ fn words<T: Copy + Send + Sync + 'static>(list: &'static [(&'static str, T)]) ->
     }))
 }
 
-/// Sides of the body that the user wants to see it from, in their order.
+/// Sides of the body to draw, in the order of the user.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Sides(Vec<Side>);
 
@@ -63,7 +63,7 @@ impl TypedValueParser for SidesParser {
     }
 }
 
-/// The turn that `--frames`, `--step` and the like leave open.
+/// Turn of a command without `--frames` and `--step`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct UsualTurn {
     /// Number of frames.
@@ -76,15 +76,16 @@ pub struct UsualTurn {
 }
 
 impl UsualTurn {
-    /// A full turn of as many frames.
+    /// Returns a full turn of `frames` frames.
     pub const fn full(frames: u32) -> UsualTurn {
         UsualTurn { frames, degrees: 360.0, step: None }
     }
 
-    /// The turn of measurements: neighbours share most of what they need, as in a movie.
+    /// Turn for measurements: 18 frames of 5 degrees. Neighbouring frames share most bricks, as in
+    /// a movie.
     pub const LAB: UsualTurn = UsualTurn { frames: 18, degrees: 90.0, step: Some(5.0) };
 
-    /// Degrees from frame to frame.
+    /// Returns the degrees from frame to frame, for a number of frames or a range.
     fn step(&self, frames: Frames) -> f64 {
         let count = match frames {
             Frames::Count(n) if n > 1 => n,
@@ -125,7 +126,8 @@ impl AxisArgs {
         self.for_summary(&volume.summary)
     }
 
-    /// Returns the axes of a volume without its samples, which must be told apart from each other.
+    /// Returns both axes, with the defaults that fit a volume of which only the description is
+    /// known.
     ///
     /// # Errors
     /// Both flags name one axis.
@@ -162,8 +164,8 @@ pub struct ViewArgs {
     azimuth: Option<f64>,
     /// One frame from a side (anterior, left, superior, ...), several, or all
     ///
-    /// anterior, left, superior, posterior, right, inferior; several with commas between, or all. In
-    /// one picture (-o sides.png) several are a grid with their names. Where the file has no
+    /// anterior, left, superior, posterior, right, inferior; several with commas between, or all.
+    /// In one picture (-o sides.png) several are a grid with their names. Where the file has no
     /// anatomical axes, --front is anterior and --up superior.
     #[arg(long, value_name = "SIDE,...|all", value_parser = SidesParser,
           hide_possible_values = true,
@@ -175,16 +177,17 @@ pub struct ViewArgs {
     elevation: f64,
     /// Content to frame: visible or volume [default: visible]
     ///
-    /// visible: what the transfer function shows within --crop is in the middle and fills 85 % of the
-    /// picture; a turn has one framing for all frames. volume: the volume's centre, and 1.25 times its
-    /// largest extent. The default is volume beside --height, and what the file says beside --path.
+    /// visible: what the transfer function shows within --crop is in the middle and fills 85 % of
+    /// the picture; a turn has one framing for all frames. volume: the volume's centre, and 1.25
+    /// times its largest extent. The default is volume beside --height, and what the file says
+    /// beside --path.
     #[arg(long, value_name = "WHAT", hide_possible_values = true,
           value_parser = words(&[("visible", Fit::Visible), ("volume", Fit::Volume)]))]
     fit: Option<Fit>,
     /// World height of the picture [default: as --fit says]
     ///
-    /// In mm where the file says so. The picture then shows the volume's centre, unless --fit visible
-    /// is given, too.
+    /// In mm where the file says so. The picture then shows the volume's centre, unless --fit
+    /// visible is given, too.
     #[arg(long, value_name = "H", value_parser = parse::positive, allow_negative_numbers = true)]
     height: Option<f64>,
     /// Parallel or perspective: ortho or persp
@@ -254,7 +257,8 @@ pub struct QualityArgs {
     #[arg(long, value_name = "E", default_value = "1/512", value_parser = parse::fraction,
           allow_negative_numbers = true, hide_short_help = true)]
     eps: f64,
-    /// Reconstruction kernel: bspline, interpolating (sharpest), gaussian or tent [default: bspline]
+    /// Reconstruction kernel: bspline, interpolating (sharpest), gaussian or tent [default:
+    /// bspline]
     ///
     /// With `--classify before` the default is gaussian. B-splines add up to one along the
     /// lattice's axes; the tent ripples by up to 39 % from other sides.
@@ -306,7 +310,7 @@ pub struct QualityArgs {
 }
 
 impl QualityArgs {
-    /// `usual` is the order of classification where no flag says which.
+    /// Returns the quality that the flags ask for; `usual` is the default order of classification.
     fn quality(&self, usual: Classify) -> Result<Quality, Fail> {
         let classify = self.classify.unwrap_or(usual);
         let default = Quality::of(classify);
@@ -383,8 +387,8 @@ impl SceneArgs {
         self.any_request(Classify::After, work, UsualTurn::LAB)
     }
 
-    /// Returns the request of a command that makes pictures for people; `turn` is what it draws where
-    /// no flag says it.
+    /// Returns the request of a command that makes pictures for people. It draws `turn` unless
+    /// flags ask for other views.
     ///
     /// # Errors
     /// A flag or file is wrong in itself.
@@ -459,10 +463,11 @@ impl VolumeSceneArgs {
         Ok(RenderRequest { level: self.input.level(), ..self.scene.request(work)? })
     }
 
-    /// Returns the request of a command about the paper's order, as [`SceneArgs::request_before`].
+    /// Returns the request of a command about the paper's order, classification before
+    /// reconstruction, with the level of detail that the flags ask for.
     ///
     /// # Errors
-    /// As [`SceneArgs::request_before`].
+    /// A flag or file is wrong in itself, or asks for the other order or a quality target.
     pub fn request_before(&self, work: Work) -> Result<RenderRequest, Fail> {
         Ok(RenderRequest { level: self.input.level(), ..self.scene.request_before(work)? })
     }

@@ -49,7 +49,7 @@ pub struct RenderRequest {
     /// Factor by which the width and height of drawn pictures are enlarged; 1 = not at all.
     /// Pictures are drawn at the path's size.
     pub magnify: u32,
-    /// How the work is cut; never changes a pixel.
+    /// Schedule and division of the work; never changes a pixel.
     pub work: Work,
     /// Background that the volume is composited over.
     pub background: Background,

@@ -146,7 +146,7 @@ impl FlyThrough {
                 let before = looks[i - 1];
                 carry(up, before, look)
             });
-            // What of `level` is across the line of sight draws up back to it, the more the
+            // The part of `level` across the line of sight pulls `up` towards it, more strongly the
             // more level the flight is.
             let across = level - look * look.dot(level);
             let drawn = if i == 0 { across } else { carried + across * (0.1 * across.length()) };
@@ -162,7 +162,7 @@ impl FlyThrough {
             ups,
             vox,
             target,
-            // Of a flight that looks ahead nothing but the near plane hangs on the distance.
+            // In a flight that looks ahead, only the near plane depends on the distance.
             ahead: 0.5 * lattice.largest_extent() / vox,
             fov: self.fov.unwrap_or(60.0),
             closed: self.closed,
@@ -289,7 +289,7 @@ mod tests {
     }
 
     fn eye(c: &Camera) -> DVec3 {
-        // Of the flight in world units: the target, and back along the line of sight.
+        // The eye in world units: from the target back along the line of sight.
         let CameraProjection::Persp { distance, .. } = c.projection else { panic!("perspective") };
         c.target + lattice().centre() + c.to_eye / c.to_eye.length() * distance
     }

@@ -99,8 +99,8 @@ impl ViewPath {
         path
     }
 
-    /// Returns the framing for a volume on `lattice` of which the hull of `points` (index positions)
-    /// can be seen; `None` if there are none.
+    /// Returns the framing for a volume on `lattice` of which the hull of `points` (index
+    /// positions) can be seen; `None` if there are none.
     ///
     /// # Errors
     /// Names the field of a camera that has no meaning.
@@ -159,8 +159,8 @@ impl Shot {
         Ok(Shot { eye_from_world: view.eye_from_world, eye_from_index: view.eye_from_index, tan })
     }
 
-    /// Eye coordinates of a point relative to a target that lies `target` (world axes, vox) from the
-    /// volume's centre.
+    /// Eye coordinates of a point relative to a target that lies `target` (world axes, vox) from
+    /// the volume's centre.
     fn project<'a>(
         &'a self,
         points: &'a [[u32; 3]],
@@ -187,7 +187,7 @@ fn fit(shots: &[Shot], points: &[[u32; 3]], lattice: &Lattice, size: [u32; 2]) -
             let distance = shot.tan.filter(|_| round > 0).map(|tan| half_height / tan);
             let (mut lo, mut hi) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
             for p in shot.project(points, centre, target) {
-                // As large as it looks at the target's depth.
+                // Scaled by perspective to its size at the target's depth.
                 let p = p * distance.map_or(1.0, |d| d / (d + p.z));
                 (lo, hi) = (lo.min(p), hi.max(p));
             }
@@ -252,8 +252,8 @@ mod tests {
         ViewPath { fit: Fit::Visible, ..ViewPath::from_turntable([400, 300], t) }
     }
 
-    /// Largest extents (right, down) of the points from the picture's middle in any frame, as shares
-    /// of half the picture, both ways.
+    /// Largest extents (right, down) of the points from the picture's middle in any frame, as
+    /// shares of half the picture, both ways.
     fn filled(path: &ViewPath, points: &[[u32; 3]], lattice: &Lattice) -> [[f64; 2]; 2] {
         let o = Orientation::new(None, None).unwrap();
         let mut most = [[0.0f64; 2]; 2];

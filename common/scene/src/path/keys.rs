@@ -237,7 +237,7 @@ impl KeyFrames {
             })?;
             keys.push(Stop { time: self.time(i), camera, pose });
         }
-        // Of the two quaternions of a turn the nearer to the one before: no flips.
+        // Each turn has two quaternions; the one nearer to the key before avoids flips.
         for i in 1..keys.len() {
             if keys[i].pose.turn.dot(keys[i - 1].pose.turn) < 0.0 {
                 keys[i].pose.turn = -keys[i].pose.turn;
@@ -408,9 +408,9 @@ impl KeyedPath {
         .camera()
     }
 
-    /// How fast everything changes at key `i`, per frame: the speed of the parabola through it and
-    /// its neighbours; at the ends that of the only side there is. A key that repeats its neighbour
-    /// is a halt.
+    /// Returns the speed of all quantities at key `i`, per frame: the speed of the parabola through
+    /// the key and its neighbours. The first and the last key have the speed of their only side. A
+    /// key that repeats its neighbour is a halt.
     fn speed(&self, i: usize) -> Speed {
         let side = |a: usize, b: usize| {
             let (p, q) = (&self.keys[a].pose, &self.keys[b].pose);

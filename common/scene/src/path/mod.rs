@@ -369,8 +369,8 @@ impl ViewPath {
         self.keyframes.as_ref().is_some_and(|k| k.keys.iter().any(|key| key.view.is_some()))
     }
 
-    /// Returns the name of the side of the body that a frame is seen from, by its number on the whole
-    /// path; `None` for frames between keys and from elsewhere.
+    /// Returns the name of the side of the body that a frame is seen from, by its number on the
+    /// whole path; `None` for frames between keys and from elsewhere.
     pub fn side_name(&self, number: usize) -> Option<&'static str> {
         let side = self.keyframes.as_ref()?.key_at(number)?.view?;
         Side::NAMES.iter().find(|(_, s)| *s == side).map(|(name, _)| *name)
@@ -386,13 +386,14 @@ impl ViewPath {
         assert!((first..first + self.frames()).contains(&number), "frame {number}");
         let one = ViewPath { range: None, ..self.clone() };
         match self.turntable {
-            // What `camera` adds up for this frame; nothing is added to it for the first.
+            // The azimuth that `camera` computes for this frame becomes the start of a turntable of
+            // one frame.
             Some(t) => {
                 let start = t.start + t.step * number as f64;
                 ViewPath { turntable: Some(Turntable { start, frames: 1, ..t }), ..one }
             }
             None if !self.views.is_empty() => ViewPath { views: vec![self.views[number]], ..one },
-            // What lies between keys hangs on all of them.
+            // A frame between keys depends on all of them.
             None => ViewPath { range: Some([number as u32; 2]), ..one },
         }
     }
@@ -457,8 +458,8 @@ impl Cameras<'_> {
     }
 }
 
-/// Lattice, orientation and curve from which the camera of each frame of a path is made. Its size grows
-/// with the number of keys or points, not with the number of frames.
+/// Lattice, orientation and curve from which the camera of each frame of a path is made. Its size
+/// grows with the number of keys or points, not with the number of frames.
 pub struct Prepared {
     lattice: Lattice,
     orientation: Orientation,

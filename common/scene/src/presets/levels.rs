@@ -17,9 +17,9 @@
 //!    the histogram falls all the way. Little foreground is *sparse*: vessels, a wire, a shell; much
 //!    of it is a *cloud*, which an opaque surface would hide.
 //!
-//! All numbers are shares of the range that presets are fitted to
-//! ([`ValueSummary::core_range`]): 0 its lower end, 1 its upper one. Mostly that is the whole range;
-//! it leaves out what one hot voxel or the padding around a scan would add to it.
+//! All numbers are shares of the range that presets are fitted to ([`ValueSummary::core_range`]): 0
+//! its lower end, 1 its upper one. Mostly that is the whole range; it leaves out what one hot voxel
+//! or the padding around a scan would add to it.
 
 use slabcast_common::volume::{SampleKind, ValueSummary};
 use std::ops::Range;
@@ -36,7 +36,8 @@ const DEPTH: f64 = 1.5;
 const FLOOR: f64 = 1.25;
 
 /// Width of a gap, as a share of the range, behind which something whole begins: a label of a
-/// segmentation, an object in an air that was set to zero. Tails of scans have gaps of a bin or two.
+/// segmentation, an object in an air that was set to zero. Tails of scans have gaps of a bin or
+/// two.
 const GAP: f64 = 0.1;
 
 /// Share of the volume above which foreground without a valley is a cloud.
@@ -264,8 +265,8 @@ fn deepest(counts: &[(f64, f64)], among: usize) -> Option<usize> {
     best.map(|(_, at)| at)
 }
 
-/// As far from the air in front of a valley as from what is behind: its lowest bin may be anywhere
-/// on a flat floor.
+/// Returns the middle bin of the floor of a valley, whose lowest bin may be anywhere on the floor.
+/// `counts` are bins with their counts; `lowest` is the index of the lowest.
 fn middle_of_floor(counts: &[(f64, f64)], lowest: usize) -> usize {
     let floor = |t: &&(f64, f64)| t.1 <= FLOOR * counts[lowest].1;
     let before = counts[..lowest].iter().rev().take_while(floor).count();
@@ -365,7 +366,7 @@ mod tests {
 
     #[test]
     fn background_above_zero_counts_as_air() {
-        // As in a tooth's scan: background about 77, dark streaks below it.
+        // A tooth's scan: background about 77, dark streaks below it.
         let l = levels(bytes(&[
             (0, 70, 200),
             (72, 83, 60_000),
@@ -398,8 +399,8 @@ mod tests {
 
     #[test]
     fn air_ends_where_noise_meets_the_body() {
-        // As in a series of MR slices: noise falls off to a twentieth of its peak, and no further
-        // before tissue rises.
+        // A series of MR slices: noise falls off to a twentieth of its peak, and no further before
+        // tissue rises.
         let noise = (0..14).map(|i| (i, i + 1, 50_000 >> (i / 3)));
         let floor = [(14, 40, 26 * 3_000)];
         let tissue = (40..80).map(|i| (i, i + 1, 12_000 - 400 * 20u32.abs_diff(i - 40)));

@@ -128,7 +128,7 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, I
     let fog = |colours: &Colours, alpha: f64| {
         unlit(look(colours, [air, top], &[[air, 0.0], [top, alpha]]))
     };
-    // Where what is dense begins, for those volumes that have no Hounsfield units to say so.
+    // Start of dense matter in volumes without Hounsfield units.
     let dense = air + (top - air) * 0.55;
     // The opacity that the file gives its voxels.
     let alpha = summary.palette.as_ref().is_some_and(|p| p.value() == ColourValue::Alpha);
@@ -142,7 +142,7 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, I
         "auto" if summary.palette.is_some() && black_is_air(summary, &l) => {
             surface(&STONE, [0.0, 1.0], 0.0, FULL_COLOUR / summary.max_code.max(FULL_COLOUR))
         }
-        // Of a CT the skin hides the bones, and the couch the body.
+        // In a CT the skin would hide the bones, and the couch the body.
         "auto" if at.is_some() => return by_name("muscle", summary),
         // At the edge of a mask nothing is to be seen but the mask.
         "auto" if body && l.masked => return by_name("brain", summary),
@@ -447,7 +447,7 @@ fn peer(summary: &ValueSummary, colors: &Colours, opacities: &[[f64; 2]]) -> Tra
     let x = |x: f64| if raw { summary.map.value(x) } else { x / 255.0 };
     let mut tf = look(colors, [0.0, 1.0], &[]);
     tf.domain = if raw { Domain::Value } else { Domain::Unit };
-    // As other renderers light it that are measured beside this one; it never changes.
+    // The lighting of the renderers that slabcast is compared with; it never changes.
     tf.shading = Shading {
         on: true,
         ambient: 0.2,
@@ -499,7 +499,7 @@ mod tests {
 
     #[test]
     fn brain_preset_shows_furrows() {
-        // As in an average brain: a little of all that fills the furrows, then grey and white.
+        // An average brain: a few samples of each value in the furrows, then grey and white matter.
         let hills = [(0, 80_000), (40, 800), (170, 9_000), (220, 6_000)];
         let v = hills.iter().flat_map(|&(at, n)| (0..n).map(move |i| (at + i % 30) as u8));
         let v = v.map(|x| if x < 30 { 0 } else { x }).collect();
@@ -531,7 +531,8 @@ mod tests {
             for w in steep {
                 let end = w[1][0];
                 let colour = |x: f64| interpolate(&tf.colors, x);
-                // Where there are bits of it: at a step the later colour holds.
+                // Just right of the step, in its middle, and just left of its end: at a step the
+                // later colour holds.
                 for x in [0.001, 0.5, 0.999].map(|t| w[0][0] + (end - w[0][0]) * t) {
                     let (here, there) = (colour(x), colour(end));
                     let off = (1..4).map(|c| (here[c] - there[c]).abs());

@@ -1,11 +1,11 @@
 //! A frame's critical path: what it waited for, from its last pixel back to its first event.
 //!
-//! How should one say why a frame took as long as it did? Sums over workers do not: a frame of 40
-//! ms with 300 ms of rendering on ten workers may have waited for one tile or for bricks. So each
-//! phase (a slab, or the whole frame where there are no barriers) is walked back from the result
-//! that ended it: its message, its rendering, what its thread rendered before, until the phase
-//! began. The gap between two tiles counts as bricks in flight, as far as the worker says that the
-//! tile lacked_bricks_us some, and else as messages and queues. All of it is on the master's clock
+//! Why did a frame take as long as it did? Sums over workers don't tell: a frame of 40 ms with 300
+//! ms of rendering on ten workers may have waited for one tile or for bricks. So each phase (a
+//! slab, or the whole frame where there are no barriers) is walked back from the result that ended
+//! it: its message, its rendering, what its thread rendered before, until the phase began. The gap
+//! between two tiles counts as bricks in flight, as far as the worker says that the tile
+//! lacked_bricks_us some, and else as messages and queues. All of it is on the master's clock
 //! ([`place_in_time`](crate::account::ledger::place_in_time)), so the parts add up to the frame's
 //! time.
 

@@ -31,7 +31,7 @@ const MAX_LEASES_PER_THREAD: u64 = 32;
 /// Limit: waiting tasks that are tried for a worker short of memory.
 const MAX_TRIES_TO_FIT: u32 = 16;
 
-/// How much is lent ahead.
+/// Amount of work that is lent ahead.
 #[derive(Clone, Copy)]
 pub(crate) struct LendAhead {
     /// Rendering time for each thread, in microseconds.
@@ -326,7 +326,7 @@ impl RegionFrame {
         let Some(history) = cluster.history.view(self.key) else { return };
         for &(id, place) in leases {
             let tile = self.core.table.tile(place);
-            // Of a piece only bricks behind its state are used.
+            // A piece needs only the bricks behind the sheets of its state.
             let begun = self.core.table.queue.tasks[place as usize].begun.as_ref();
             let first_sheet = begun.and_then(|begun| begun.sheets.iter().flatten().min());
             for (bricks, is_part) in history.bricks_elsewhere(&tile, id) {
@@ -455,9 +455,9 @@ impl RegionFrame {
     }
 }
 
-/// Whether a worker may try a task that workers failed at or that is audited: the likeliest do. These
-/// are workers that have not failed at it, and of them those that have drawn something before, since
-/// anybody may call himself a new worker.
+/// Whether a worker may try a task that workers failed at or that is audited: the likeliest do.
+/// These are workers that have not failed at it, and of them those that have drawn something
+/// before, since anybody may call himself a new worker.
 pub(super) fn may_try(cluster: &Cluster, task: &Task, id: WorkerId) -> bool {
     let rank = |w: &Worker| match task.was_failed_by(&w.identity) {
         true => 0,

@@ -31,7 +31,7 @@ pub(crate) fn patience_us(expected_us: f64) -> Micros {
     SILENCE_US.saturating_add((SILENCE_RATIO * expected_us) as Micros)
 }
 
-/// How long tasks take, by the last ones of the frame.
+/// Durations of the last tasks of a frame.
 #[derive(Debug, Default)]
 pub(crate) struct Pace {
     last: VecDeque<TaskTime>,

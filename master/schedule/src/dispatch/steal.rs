@@ -302,7 +302,7 @@ impl RegionFrame {
         if !self.core.sole || queue.waiting() > 0 || cluster.link_use.bricks_bind() {
             return Vec::new();
         }
-        // Where all tiles are short none need be looked at.
+        // If all tiles are short, none is worth splitting.
         if self.tiles.longest_us() < least_to_split(PIECE_TRANSFER_US) {
             return Vec::new();
         }

@@ -1,4 +1,5 @@
-//! How many workers draw. The others are held in reserve: they are lent nothing and sent nothing.
+//! Chooses the number of workers that draw. The others are held in reserve: they are lent nothing
+//! and sent nothing.
 //!
 //! Each worker that draws is sent bricks, bricks at the border of two workers' tiles go to both,
 //! and each tile takes the master's time. So with `n` workers a frame takes about
@@ -58,7 +59,7 @@ pub(crate) struct FrameCost {
 /// Sums over frames of one kind, and the number of workers that follows.
 #[derive(Clone, Copy, Debug, Default)]
 struct Level {
-    /// How often the workers are halved.
+    /// Number of times that the workers are halved.
     halvings: u32,
     /// Frames since that changed.
     frames: u32,
@@ -120,7 +121,7 @@ pub(crate) struct ActiveSet {
     first_workers: usize,
     /// Serial time of the first frame, in microseconds.
     first_us: f64,
-    /// Of overlapping frames, and of sole ones.
+    /// Levels of overlapping frames, and of sole ones.
     levels: [Level; 2],
 }
 

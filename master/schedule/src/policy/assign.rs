@@ -167,8 +167,8 @@ impl Group {
 struct Times<'a> {
     tiles: &'a [TileToAssign],
     threads: &'a [f64],
-    /// How much slower than others each worker is, and each tile's last worker. Looked up once,
-    /// since a search asks for a time thousands of times.
+    /// Slowness of each worker relative to the others, looked up once, since a search needs it
+    /// thousands of times.
     slowness: Vec<f64>,
     last_slowness: Vec<Option<f64>>,
     /// No worker counts as slower than another.

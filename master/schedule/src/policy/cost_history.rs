@@ -51,7 +51,7 @@ const MAX_HISTORIES: usize = 3;
 /// workers.
 pub(crate) type HistoryKey = (BrickSetKey, [u32; 2], Option<u32>);
 
-/// How much slower each worker is than others: a moving average on a logarithmic scale.
+/// Slowness of each worker relative to the others: a moving average on a logarithmic scale.
 #[derive(Debug, Default)]
 pub(crate) struct WorkerRates {
     slowness: WorkerMap<f64>,

@@ -1,4 +1,4 @@
-//! How fast the link is, and which share of the time bricks and results take of it.
+//! Measures the rate of the link, and the share of its time that bricks and results take.
 //!
 //! Nobody tells the scheduler how fast the link is; it sees when bricks leave and when workers
 //! acknowledge them. From the moment at which some are in flight to any worker until none are, the

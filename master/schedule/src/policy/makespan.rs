@@ -49,7 +49,7 @@ pub(crate) fn choose_splits(
     let parts: Vec<Vec<u64>> = (0..n).map(parts).collect();
     let mut order: Vec<usize> = (0..n).collect();
     order.sort_by(|&a, &b| us[b].total_cmp(&us[a]));
-    // What splitting so many of the longest adds: to the time of all tiles, and to their number.
+    // Entry n: time and tiles that splitting the n longest tiles adds.
     let mut added = vec![(0.0, 0)];
     for (&i, rank) in order.iter().zip(0..) {
         let (time, tiles): (f64, usize) = added[rank];
@@ -216,7 +216,7 @@ mod tests {
     fn makespan_splits_nothing_where_tiles_are_fine_enough_or_short() {
         let many: Vec<f64> = (0..100).map(|i| 2000.0 + 10.0 * f64::from(i)).collect();
         assert!(!cut(&many, 4).contains(&true));
-        // Of 50 us each, cutting would only have the master hear more of them.
+        // Tiles of 50 us stay whole: cutting them would only give the master more messages.
         assert!(!cut(&[50.0; 8], 6).contains(&true));
         assert!(cut(&[], 4).is_empty());
         assert_eq!(cut(&[1000.0], 0), [false]);

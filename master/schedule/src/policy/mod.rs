@@ -1,5 +1,5 @@
-//! How the scheduler decides: where a picture is cut, who draws which tile, how many workers draw,
-//! and which bricks are sent before anybody asks.
+//! Policies of the scheduler: they decide where a picture is cut, who draws which tile, how many
+//! workers draw, and which bricks are sent before a worker asks.
 
 pub(crate) mod active_set;
 pub(crate) mod assign;

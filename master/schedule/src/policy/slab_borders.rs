@@ -13,8 +13,8 @@ use slabcast_common::quality::{Borders, Work};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projected, View};
 
-/// Tuning (vox): depth behind a leaf's front at which it becomes opaque, one and a half bricks.
-/// What is one voxel thin is opaque within five; a skin that rises over some voxels takes ten.
+/// Tuning (vox): depth behind a leaf's front at which it becomes opaque, one and a half bricks. A
+/// leaf one voxel thin is opaque within five; a skin that rises over some voxels takes ten.
 const OPAQUE_DEPTH_VOX: f64 = 12.0;
 
 /// Tuning (vox): distance between candidate borders, a brick's edge. Bricks begin no finer.
@@ -102,8 +102,8 @@ fn hidden_from(
 /// with the front borders first.
 fn best(tried: &[i32], bricks: &[Guess], count: usize) -> Vec<i32> {
     let n = tried.len() - 1;
-    // Of a slab from border `a` to `b`: voxels of bricks that begin in it and are not hidden at
-    // `a`.
+    // For a slab from border `a` to `b`: voxels of the bricks that begin in it and are not hidden
+    // at `a`.
     let mut needed = vec![0u64; (n + 1) * (n + 1)];
     for b in bricks {
         // The last border at or in front of it.

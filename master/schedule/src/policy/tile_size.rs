@@ -81,7 +81,7 @@ impl CutContext<'_> {
     fn choose_edge(&self, through: &Through, known_us: f64) -> PricedCut {
         let largest = match self.is_local {
             true => u32::MAX,
-            // What the first frame is cut into the next ones go on with, and nothing is known yet.
+            // The first frame has no history, and the next frames keep its tiles.
             false if self.threads > 1 && self.history.is_empty() => WHOLE_PX,
             false => MAX_REMOTE_TILE_PX,
         };
@@ -108,7 +108,7 @@ impl CutContext<'_> {
             let cut = self.price(through.cut(edge));
             let end = self.end_us(&cut);
             let is_better = |(least, kept): &(f64, PricedCut)| {
-                // Of equal ones the coarser: fewer messages.
+                // Among equal cuts the coarser one wins: it has fewer messages.
                 end < *least || end <= *least && last != Some(kept.cut.edge)
             };
             if best.as_ref().is_none_or(is_better) {
@@ -177,7 +177,7 @@ mod tests {
     use slabcast_common::ids::WorkerId;
     use slabcast_common::volume::Digest32;
 
-    /// As a head lies in a picture: 24 tiles of 128 pixels, 56 of 64.
+    /// Returns the edge of tiles for a picture of a head: 24 tiles of 128 pixels, 56 of 64.
     fn edge(threads: usize, sole: bool, is_local: bool) -> u32 {
         let through = Through::new([512, 512], &[Rect::new(90, 40, 430, 480)]);
         let mut history = CostHistory::default();

@@ -51,7 +51,7 @@ pub fn is_shut(a: f32, eps: f64) -> bool {
     eps > 0.0 && (1.0f32 - a) < eps as f32
 }
 
-/// Where a frame stands.
+/// Stage of a frame's rendering.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Stage {
     /// The next phase has not begun.
@@ -388,7 +388,7 @@ impl Frame {
                     Frame::Slab(frame) => frame.end_slab(cluster, clock.now()),
                     Frame::Region(frame) => frame.end_regions(clock.now()),
                 },
-                // How a frame is cut depends on the number of threads.
+                // The cut of a frame depends on the number of threads, so it waits for workers.
                 Stage::Waiting if cluster.roster.threads() == 0 => return Step::Waits,
                 Stage::Waiting => {
                     let began = clock.now();

@@ -16,7 +16,7 @@ use std::collections::{BTreeMap, BTreeSet};
 #[derive(Debug)]
 pub(crate) struct SlabFrame {
     pub(crate) core: FrameCore,
-    /// Where each brick lands; `None` outside the picture.
+    /// Projection of each brick; `None` outside the picture.
     projected: Vec<Option<Projected>>,
     /// Sheets of each slab, front to back.
     slabs: Vec<SheetRange>,

@@ -11,11 +11,11 @@
 //! together. So a suspect is never lent to a worker that has another, and when a worker is lost
 //! with a suspect on it, only those blamed most before are blamed again.
 //!
-//! **When is a task given up?** Never while a worker is linked that has not failed at it. Workers are
-//! told apart by what they are over all their links ([`WorkerIdentity`]), so that one that comes back
-//! after each crash counts once. Between tries of a task there are pauses, each twice as long as the
-//! one before: whatever makes workers fail may pass, and a better worker may come. Only when every
-//! linked worker has failed at a task, and it was tried often enough, its frame fails
+//! **When is a task given up?** Never while a worker is linked that has not failed at it. Workers
+//! are told apart by what they are over all their links ([`WorkerIdentity`]), so that one that
+//! comes back after each crash counts once. Between tries of a task there are pauses, each twice as
+//! long as the one before: whatever makes workers fail may pass, and a better worker may come. Only
+//! when every linked worker has failed at a task, and it was tried often enough, its frame fails
 //! ([`TaskQueue::hopeless`]).
 
 use crate::policy::macrotile::Macrotile;
@@ -26,8 +26,9 @@ use slabcast_common::message::Checkpoint;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Limit: pause before the third try of a task, in microseconds. The second try follows at once: most
-/// losses have nothing to do with a task. Later pauses are twice as long each, up to the longest.
+/// Limit: pause before the third try of a task, in microseconds. The second try follows at once:
+/// most losses have nothing to do with a task. Later pauses are twice as long each, up to the
+/// longest.
 const FIRST_PAUSE_US: Micros = 100_000;
 const LONGEST_PAUSE_US: Micros = 2_000_000;
 
@@ -45,7 +46,7 @@ pub(crate) struct Lease {
     deadline: Option<Micros>,
 }
 
-/// How a task ended.
+/// End of a task.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum End {
     /// No result yet.
@@ -58,7 +59,7 @@ pub(crate) enum End {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Failure {
     pub(crate) who: Arc<WorkerIdentity>,
-    /// How often.
+    /// Number of failures.
     pub(crate) times: u32,
     /// Reason the worker gave when it refused the task last; `None` if its link was lost instead.
     pub(crate) said: Option<String>,
@@ -75,7 +76,7 @@ pub(crate) struct Task {
     queued: Option<i64>,
     /// Workers that were lost with it or refused it, each once.
     pub(crate) failures: Vec<Failure>,
-    /// How often a worker was lost that was probably running it.
+    /// Number of times that a worker was lost while it was probably running the task.
     blamed: u32,
     /// While it waits after a failure: until when only the likeliest workers may try it.
     choosy_until: Option<Micros>,
@@ -115,8 +116,8 @@ impl Task {
         self.blamed > 0
     }
 
-    /// Whether a worker's lease of the task is before its deadline; `None` if the worker has no lease
-    /// of the task.
+    /// Whether a worker's lease of the task is before its deadline; `None` if the worker has no
+    /// lease of the task.
     pub(crate) fn expects(&self, worker: WorkerId) -> Option<bool> {
         self.leases.iter().find(|l| l.worker == worker).map(|l| l.deadline.is_some())
     }
@@ -130,12 +131,12 @@ impl Task {
         self.audit.as_ref()
     }
 
-    /// How often a worker failed at it.
+    /// Returns the number of times that workers failed at the task.
     pub(crate) fn tries(&self) -> u32 {
         self.failures.iter().fold(0, |sum, f| sum.saturating_add(f.times))
     }
 
-    /// Whether a worker failed at it, on this link or an earlier one.
+    /// Returns whether a worker failed at the task, on this link or an earlier one.
     pub(crate) fn was_failed_by(&self, who: &WorkerIdentity) -> bool {
         self.failures.iter().any(|f| *f.who == *who)
     }
@@ -269,8 +270,8 @@ impl TaskQueue {
         (place < self.tasks.len() as u64).then_some(place as u32)
     }
 
-    /// Returns the first waiting task with `among` and `suits` that a worker may have. `mine`: tasks
-    /// it has leases of. `may_try`: whether it may try a task that workers failed at.
+    /// Returns the first waiting task with `among` and `suits` that a worker may have. `mine`:
+    /// tasks it has leases of. `may_try`: whether it may try a task that workers failed at.
     pub(crate) fn next_for(
         &self,
         mine: impl Fn() -> Vec<u32>,
@@ -564,7 +565,8 @@ impl TaskQueue {
         }
     }
 
-    /// Takes tasks out of the queue again whose worker is heard again and that nobody else was lent.
+    /// Takes tasks out of the queue again whose worker is heard again and that nobody else was
+    /// lent.
     pub(crate) fn unshare(&mut self, worker: WorkerId, places: &[u32]) {
         for &place in places {
             let task = &mut self.tasks[place as usize];
@@ -669,7 +671,7 @@ mod tests {
         q.lease(5, WorkerId(2), 0, &c);
         assert_eq!(same(&q, &[5, 2, 4], &[2]), Some(4));
         assert_eq!(same(&q, &[5, 2], &[2]), None);
-        // What comes back is before all others, the last one first.
+        // Tasks that come back are ahead of all others, the last one first.
         lose(&mut q, 2, &[(5, Epoch(0))], 0, 0);
         q.share_queued(&[2]);
         assert_eq!(q.all_waiting().collect::<Vec<_>>(), [2, 5, 0, 1, 3, 4]);

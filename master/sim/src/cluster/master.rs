@@ -255,7 +255,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
                 let costs = &self.master.costs;
                 let shared = self.machine.is_some();
                 let pixel_ns = if shared { costs.mark_pixel_ns } else { costs.finish_pixel_ns };
-                // Of tiles that came finished only the last ones are left.
+                // Tiles that arrived finished are encoded already; only the others are left.
                 let left = state.encoded_tiles().iter().map(|(tile, _)| tile.area()).sum::<usize>();
                 let pixels = match job.finish {
                     Some(_) if !shared => left as f64,

@@ -9,7 +9,7 @@ use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_schedule::{FrameJob, Micros};
 use slabcast_sim::{Incident, Rng, WorkerProfile};
 
-/// A frame of a client, of a set of its own.
+/// Returns a frame of a client, with a brick set of its own.
 fn job_of(client: u64, frame: u64, edge: u32, thickness: f64) -> Box<FrameJob> {
     let quality = Quality { thickness, ..Quality::before() };
     let scene = pattern::scene(client, pattern::key(client as u8), DIMS, quality);
@@ -19,7 +19,7 @@ fn job_of(client: u64, frame: u64, edge: u32, thickness: f64) -> Box<FrameJob> {
     job
 }
 
-/// A frame whose tiles take minutes on a slow worker.
+/// Returns a frame whose tiles take minutes on a slow worker.
 fn costly(client: u64, frame: u64) -> Box<FrameJob> {
     job_of(client, frame, 64, 0.25)
 }
@@ -28,7 +28,7 @@ fn cheap(client: u64, frame: u64) -> Box<FrameJob> {
     job_of(client, frame, 32, 4.0)
 }
 
-/// A worker of one thread that takes 0.1 ms for a pixel and sheet.
+/// Returns a worker of one thread that takes 0.1 ms for a pixel and sheet.
 fn slow() -> WorkerProfile {
     WorkerProfile { time_factor: 100.0, time_jitter: 0.0, ..typical() }
 }

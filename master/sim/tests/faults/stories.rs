@@ -272,7 +272,7 @@ fn only_missing_bricks_are_sent() {
     assert!(first.workers.iter().all(|w| w.bricks_sent == first.bricks.needed));
     assert!(first.workers.iter().all(|w| w.bricks_held == w.bricks_sent));
 
-    // The same view again; then one of them comes back from the dead with its memory.
+    // The view is drawn once more; then a worker dies and rejoins with most of its bricks.
     let mut again = job(0);
     again.frame = FrameId(1);
     w.add_frame(again.clone());
@@ -575,7 +575,7 @@ fn overlapping_frames_keep_the_tile_owners_of_the_first() {
     let mut w = world();
     workers(&mut w, 8);
     for frame in 0..4 {
-        // The same view again and again.
+        // One view, frame after frame.
         let work = Work { tile: Some(16), schedule: Schedule::Region, ..slab() };
         let quality = Quality { thickness: 1.0, ..Quality::before() };
         let mut job = job_with(0, work, quality);
@@ -609,7 +609,7 @@ fn workers_get_shares_of_a_path_by_their_speed() {
         }
         w.until(|w| w.observer.done.len() >= 8);
         let (from, done) = (w.now(), w.observer.done.len());
-        // Of 16 frames it varies by 6 %, by chance.
+        // Over 16 frames it would vary by 6 %, by chance.
         w.until(|w| w.observer.done.len() >= 72);
         let each = (w.now() - from) as f64 / (w.observer.done.len() - done) as f64;
         w.finish();

@@ -1,15 +1,17 @@
-//! All levels of a volume in one pass over its numbers.
+//! Makes all levels of a volume in one pass over its numbers.
 //!
-//! 64 planes of a level are collected, looked at and written, halved, and added to the planes of the
-//! next level; so each level holds at most 64 of its planes. For nx x ny samples of `c` bytes as codes
-//! and `n` in the file, of which the file's own are held only where codes round them, that is at most
+//! A level collects 64 planes, surveys and writes them, halves them, and adds the result to the
+//! planes of the next level. So each level holds at most 64 of its planes. With nx x ny samples a
+//! plane, `c` bytes a code and `n` bytes a number in the file (0 unless codes round the numbers, so
+//! that both are held), a pass takes at most
 //!
 //! ```text
 //! 64 nx ny (1.5 c + n) + 192 MiB
 //! ```
 //!
-//! bytes: four thirds for all levels and an eighth for the planes that were just halved; 64 MiB for the
-//! codes of blocks, and the rest for pieces on their way in and out ([`memory_bytes`]).
+//! bytes: four thirds for all levels, an eighth for the planes that were just halved, 64 MiB for
+//! the sets of codes of blocks, and the rest for pieces that are read or written
+//! ([`memory_bytes`]).
 
 use super::coding::Coding;
 use super::ome_zarr::LevelWriter;
@@ -20,10 +22,11 @@ use crate::error::{OpenErrorKind, Problem};
 use crate::samples::reserve;
 use slabcast_common::volume::{Lattice, Samples};
 
-/// Bytes beside the planes.
+/// Bytes of memory that a pass takes beside the planes.
 const BESIDE_BYTES: u64 = 192 << 20;
 
-/// Returns the most memory that one pass takes, in bytes.
+/// Returns the most memory that one pass takes, in bytes; `levels` tells whether there are coarser
+/// levels.
 pub(crate) fn memory_bytes(lattice: &Lattice, coding: &Coding, levels: bool) -> u64 {
     let [nx, ny, nz] = lattice.dims.map(u64::from);
     let code = coding.kind().bytes() as u64;
@@ -34,29 +37,30 @@ pub(crate) fn memory_bytes(lattice: &Lattice, coding: &Coding, levels: bool) -> 
     nx.saturating_mul(ny).saturating_mul(planes * halves / 2).saturating_add(BESIDE_BYTES)
 }
 
-/// One level on its way.
+/// A level that is being made.
 struct Level {
     lattice: Lattice,
     survey: Survey,
     writer: Option<LevelWriter>,
-    /// Planes that were not looked at yet: fewer than 64.
+    /// Planes that wait to be surveyed, as codes: fewer than 64.
     codes: Samples,
-    /// The file's own numbers of these planes, where codes round them.
+    /// The waiting planes as the file's own numbers, if codes round them.
     own: Vec<u8>,
-    /// Samples of 64 planes.
+    /// Number of samples in 64 planes.
     full: usize,
-    /// Number of planes looked at.
+    /// Number of planes surveyed.
     done: u32,
 }
 
-/// The levels of a volume whose numbers come in order.
+/// All levels of a volume that are made while its numbers arrive in order.
 pub(crate) struct Cascade<'a> {
     coding: &'a Coding,
     levels: Vec<Level>,
 }
 
 impl<'a> Cascade<'a> {
-    /// Begins with levels on these lattices, each with its writer; `None` surveys them alone.
+    /// Begins levels on these lattices. `writers` has one for each level; `None` surveys the levels
+    /// without writing them.
     pub(crate) fn new(
         lattices: &[Lattice],
         coding: &'a Coding,
@@ -92,7 +96,7 @@ impl<'a> Cascade<'a> {
     /// Adds the next numbers of level 0, as little-endian bytes that end between numbers.
     ///
     /// # Errors
-    /// More numbers than the volume has; a level can't be written.
+    /// There are more numbers than the volume has, or a level can't be written.
     pub(crate) fn push(&mut self, mut bytes: &[u8]) -> Result<(), Problem> {
         let size = self.coding.number.bytes() as usize;
         while !bytes.is_empty() {
@@ -112,7 +116,8 @@ impl<'a> Cascade<'a> {
         Ok(())
     }
 
-    /// Looks at the planes of a level if they are 64, or the last.
+    /// Surveys, writes and halves the waiting planes of a level if there are 64, or if they are the
+    /// last.
     fn flush_full(&mut self, level: usize) -> Result<(), Problem> {
         let this = &self.levels[level];
         let [nx, ny, nz] = this.lattice.dims;
@@ -163,10 +168,10 @@ impl<'a> Cascade<'a> {
         Ok(())
     }
 
-    /// Returns what was found at each level.
+    /// Ends all levels and returns the results of their surveys, the finest first.
     ///
     /// # Errors
-    /// Numbers are missing; a level can't be written.
+    /// Numbers are missing, or a level can't be written.
     pub(crate) fn finish(self) -> Result<Vec<Surveyed>, Problem> {
         let mut found = Vec::new();
         for level in self.levels {
@@ -199,7 +204,7 @@ fn append(to: &mut Samples, from: Samples) {
     }
 }
 
-/// Checks that a pass of `need` bytes fits into `most`.
+/// Checks that a pass of `need` bytes of memory fits into `most`. `remedy` ends the error message.
 pub(crate) fn check_memory(need: u64, most: u64, remedy: &str) -> Result<(), Problem> {
     match need <= most {
         true => Ok(()),

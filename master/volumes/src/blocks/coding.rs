@@ -1,8 +1,8 @@
-//! How the numbers of a file become codes, and codes become numbers again.
+//! Converts the numbers of a file to codes, piece by piece, and codes back to numbers.
 //!
-//! [`crate::samples`] says which codes each type has; those of wide types depend on the range of all
-//! numbers ([`NumberRange`]), which is found in a pass of its own. Codes made here equal those of a
-//! volume that was read as a whole.
+//! The table in [`crate::samples`] gives the codes of each type. Codes of wide types depend on the
+//! range of all numbers ([`NumberRange`]), which takes a pass of its own. A volume read in pieces
+//! gets the same codes as one that is read as a whole.
 
 use crate::error::Problem;
 use crate::samples::Number;
@@ -19,18 +19,20 @@ pub(crate) struct Coding {
     pub(crate) rescale: ValueMap,
 }
 
-/// The forms of codes.
+/// Form of the codes that a [`Coding`] makes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Form {
-    /// uint8, uint16: as they are.
+    /// uint8, uint16: the numbers themselves.
     Same,
-    /// int8, int16: with the top bit flipped.
+    /// int8, int16: the numbers with their top bit flipped.
     Flipped,
-    /// float32; what is larger than `limit` is a filler, and becomes NaN.
+    /// float32: the numbers themselves. A finite number above `limit` in size is a filler and
+    /// becomes NaN.
     Floats { limit: Option<f64> },
     /// Wider integers from `min` to `max`: u16 above `min` if they fit, else f32 in 0..1.
     Integers { min: i128, max: i128 },
-    /// float64 as f32 by a map; what is larger than `limit` is a filler, and becomes NaN.
+    /// float64: f32 codes, with a map from codes to numbers. A finite number above `limit` in size
+    /// is a filler and becomes NaN.
     Doubles { map: ValueMap, limit: f64 },
 }
 
@@ -43,14 +45,14 @@ pub(crate) enum NumberRange {
     },
     Floats {
         fillers: Fillers,
-        /// Range of the values that are smaller than the largest.
+        /// Range of the numbers whose size is below the largest size.
         below: (f64, f64),
-        /// Whether the largest is there with a plus, and with a minus.
+        /// Whether the largest size occurs with a plus sign, and with a minus sign.
         largest: (bool, bool),
     },
 }
 
-/// Calls a macro with the type of a number.
+/// Calls the macro `$do` with the Rust type of `$number`.
 macro_rules! by_type {
     ($number:expr, $do:ident) => {
         match $number {
@@ -78,7 +80,8 @@ macro_rules! numbers {
 }
 
 impl NumberRange {
-    /// Returns the range of no numbers; `None` for a type whose codes do not depend on it.
+    /// Returns an empty range, to be widened; `None` for a type whose codes do not depend on the
+    /// range.
     pub(crate) fn new(number: Number) -> Option<NumberRange> {
         match number {
             Number::U8 | Number::I8 | Number::U16 | Number::I16 => None,
@@ -141,8 +144,8 @@ impl NumberRange {
         }
     }
 
-    /// Returns the range of the values that are no fillers; the first is above the second if there are
-    /// none.
+    /// Returns the smallest and the largest number that is not a filler. Without such a number the
+    /// first is above the second.
     fn of_values(&self) -> (f64, f64) {
         match self {
             NumberRange::Integers { min, max } => (*min as f64, *max as f64),
@@ -161,7 +164,7 @@ impl NumberRange {
     }
 }
 
-/// Returns the bytes of all items.
+/// Returns the bytes of all items, one after another; `bytes` converts one item.
 fn words<T: Copy, const SIZE: usize>(items: &[T], bytes: impl Fn(T) -> [u8; SIZE]) -> Vec<u8> {
     let mut all = vec![0; items.len() * SIZE];
     all.chunks_exact_mut(SIZE).zip(items).for_each(|(to, &item)| to.copy_from_slice(&bytes(item)));
@@ -169,7 +172,8 @@ fn words<T: Copy, const SIZE: usize>(items: &[T], bytes: impl Fn(T) -> [u8; SIZE
 }
 
 impl Coding {
-    /// Returns the coding of numbers with this range, which is `None` for the types that need none.
+    /// Returns the coding of numbers of type `number` within `range`; `None` for types whose codes
+    /// do not depend on it.
     pub(crate) fn new(number: Number, rescale: ValueMap, range: Option<&NumberRange>) -> Coding {
         let form = match (number, range) {
             (Number::U8 | Number::U16, _) => Form::Same,
@@ -205,7 +209,7 @@ impl Coding {
     /// Returns the map from codes to values.
     pub(crate) fn map(&self) -> ValueMap {
         let stored = self.stored();
-        // Composed as readers do it, so that digests are equal.
+        // In the readers' order of operations, so that digests are equal.
         match self.rescale {
             ValueMap::IDENTITY => stored,
             ValueMap { scale, offset } => {
@@ -225,7 +229,7 @@ impl Coding {
         }
     }
 
-    /// Returns whether numbers can't be made of their codes again, to the bit.
+    /// Returns whether codes lose bits: numbers made of them may differ from the file's.
     pub(crate) fn rounds(&self) -> bool {
         match self.form {
             Form::Same | Form::Flipped => false,
@@ -235,8 +239,8 @@ impl Coding {
         }
     }
 
-    /// Returns the smallest and the largest finite code of level 0, of f32 codes whose numbers have this
-    /// range; 0 and 0 if there is none.
+    /// Returns the smallest and the largest finite f32 code of level 0, for numbers within `range`;
+    /// 0 and 0 if no number is finite.
     pub(crate) fn code_range(&self, range: &NumberRange) -> (f64, f64) {
         let (lo, hi) = match self.form {
             Form::Integers { .. } => (0.0, 1.0),
@@ -269,7 +273,7 @@ impl Coding {
                 })),
             },
             (Form::Integers { min, max }, Samples::U16(to)) => {
-                // Levels of other programs may go beyond the range of the first.
+                // Coarser levels from other programs may go beyond the range of level 0.
                 macro_rules! extend {
                     (f32) => {{}};
                     (f64) => {{}};
@@ -304,7 +308,8 @@ impl Coding {
         }
     }
 
-    /// Returns the numbers of codes, as little-endian bytes; rounded where the type needs it.
+    /// Converts codes to numbers, as little-endian bytes, rounded if the file's type has whole
+    /// numbers.
     ///
     /// # Panics
     /// If the codes have another type than the coding's.
@@ -357,7 +362,8 @@ impl Coding {
         }
     }
 
-    /// Returns the numbers of codes like [`Coding::numbers`], without a copy where they are the same.
+    /// Converts codes to numbers, as little-endian bytes. Takes the codes, so that 8-bit codes
+    /// which are the numbers need no copy.
     pub(crate) fn numbers_of(&self, codes: Samples) -> Vec<u8> {
         match (self.form, codes) {
             (Form::Same, Samples::U8(v)) => v,
@@ -365,7 +371,8 @@ impl Coding {
         }
     }
 
-    /// Returns codes of a coarser level as a file of the numbers' type gives them back.
+    /// Returns the codes that a reader gets back after `codes` were written in the file's number
+    /// type.
     pub(crate) fn as_stored(&self, codes: Samples) -> Samples {
         if !self.rounds() || matches!(self.form, Form::Floats { .. }) {
             return codes;
@@ -375,7 +382,10 @@ impl Coding {
         stored
     }
 
-    /// Checks that slope and intercept keep values finite, as readers do.
+    /// Checks that slope and intercept keep values finite.
+    ///
+    /// # Errors
+    /// They take the values out of the range of numbers.
     pub(crate) fn check(&self) -> Result<(), Problem> {
         let map = self.map();
         match map.scale.is_normal() && map.offset.is_finite() {

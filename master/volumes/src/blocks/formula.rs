@@ -1,10 +1,11 @@
-//! A volume by formula whose samples are computed when they are asked for, at every level: of any
-//! size, for tests of large volumes.
+//! Volume by formula for tests of large volumes: it has any size, and its samples are computed when
+//! they are read, at every level.
 //!
-//! `cells` has cells of 64^3 samples. Seven of eight are 0 throughout; each of the others has a value of
-//! its own, to which every second sample adds 16 and from which the others take 16, like a chessboard in
-//! space. Two samples along each axis have the cell's value as their mean, so that coarser levels are
-//! known without the finer ones, down to one sample a cell; those after it are means of these.
+//! The formula `cells` has cells of 64^3 samples. Seven of eight cells are 0 throughout. Each other
+//! cell has a value of its own; its samples are alternately 16 above and 16 below it, like a
+//! chessboard in space. The mean of two samples along each axis is the cell's value. So levels 1 to
+//! 6 are known without the finer ones; level 6 has one sample a cell. Levels after it are means of
+//! level 6.
 
 use super::mean::{halved, level_lattices};
 use super::{BLOCK_EDGE, BlockSource, BlockSummaries, BlockSummary, ValueBins, block_dims};
@@ -17,35 +18,35 @@ use std::sync::Arc;
 
 /// Levels at which a cell has more than one sample: 64 = 2^6.
 const CELL_LEVELS: usize = 6;
-/// What a sample differs by from its cell.
+/// Difference of a sample of level 0 from its cell's value.
 const DETAIL: u8 = 16;
-/// Most samples of which the digest is computed: 0.1 s.
+/// Most samples of level 0 for which the digest is computed from the samples; it takes 0.1 s.
 const HASHED_MAX: u64 = 1 << 26;
-/// Most cells: their values are kept.
+/// Most cells. One byte of each is kept in memory.
 const CELLS_MAX: u64 = 1 << 24;
 
 /// The formula `cells` at all levels.
 pub struct FormulaSource {
     name: String,
     levels: Vec<VolumeInfo>,
-    /// Samples of level 6 and of those after it; of fewer levels those of the cells all the same.
+    /// Samples of level 6 and of each level after it. The first entry, the values of the cells, is
+    /// there even if the volume has fewer levels.
     coarse: Vec<Samples>,
     /// Cells along each axis.
     cells: [u32; 3],
 }
 
 impl FormulaSource {
-    /// Prefix of the names that are read here; the size follows.
+    /// Prefix of the names that [`FormulaSource::open`] takes; the size follows it.
     pub const PREFIX: &str = "formula:cells:";
 
-    /// Returns the volume that a text such as `formula:cells:2048x2048x4096` names; one number is the
-    /// edge of a cube.
+    /// Parses a name such as `formula:cells:2048x2048x4096`; one number is the edge of a cube.
     ///
-    /// The digest is that of the samples where there are at most 2^26 of them. More would take seconds;
-    /// then it is a digest of the size and the formula's name.
+    /// The digest of a volume of at most 2^26 samples is computed from its samples. For larger
+    /// ones, which would take seconds, it is a digest of the size and the formula's name.
     ///
     /// # Errors
-    /// No such size, or more than 2^24 cells.
+    /// The size can't be parsed or has a zero, or there are more than 2^24 cells.
     pub fn open(text: &str) -> Result<FormulaSource, Problem> {
         let size = text.strip_prefix(Self::PREFIX).unwrap_or(text);
         let numbers: Result<Vec<u32>, _> = size.split('x').map(str::parse).collect();
@@ -172,13 +173,14 @@ impl FormulaSource {
         Samples::U8(all)
     }
 
-    /// Returns the codes of the blocks of a level.
+    /// Returns the summary of one block of a level, at block position `at`.
     fn block(&self, level: usize, at: [u32; 3], bins: &ValueBins) -> BlockSummary {
         let dims = self.levels[level].lattice.dims;
         let lo = at.map(|n| n * BLOCK_EDGE);
         let hi: [u32; 3] = std::array::from_fn(|a| (lo[a] + BLOCK_EDGE).min(dims[a]));
         if level == 0 {
-            // A corner of two samples an edge has all codes of its cell, and so have odd ends.
+            // A block of even sides has all its codes in a corner of two samples an edge. Odd ends
+            // have samples without detail, so the whole block is computed.
             let size = |a: usize| hi[a] - lo[a];
             if (0..3).all(|a| dims[a] == 1 || size(a).is_multiple_of(2)) {
                 let corner = std::array::from_fn(|a| lo[a] + size(a).min(2));
@@ -245,8 +247,8 @@ fn cell_value(cell: [u32; 3]) -> u8 {
     if h & 7 == 0 { 40 + ((h >> 8) % 160) as u8 } else { 0 }
 }
 
-/// Returns a sample of level 0 in a cell of this value. Samples without a neighbour in their pair have
-/// no detail, so that every mean is the cell's value.
+/// Returns the sample of level 0 at `at`, in a cell of this value. A sample at an odd end, without
+/// a neighbour in its pair, is the cell's value itself, so that every mean is the cell's value.
 fn detailed(value: u8, dims: [u32; 3], at: [u32; 3]) -> u8 {
     let halved = |a: &usize| dims[*a] > 1;
     let paired = (0..3).filter(halved).all(|a| at[a] | 1 < dims[a]);

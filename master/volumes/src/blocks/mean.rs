@@ -1,10 +1,10 @@
-//! Halving: the next coarser level of a volume.
+//! Halving: makes the next coarser level of a volume.
 //!
 //! A sample of the next level is the mean of two samples along each halved axis; integers are
-//! rounded half up, so that all machines agree. An axis whose step is twice the smallest or more
-//! stays as it is, and so does one of a single sample: thick slices keep their number until the
-//! others are as thick. Where a side has an odd number of samples, the last mean is over those there
-//! are.
+//! rounded half up, so that all machines agree. An axis with a step of at least twice the smallest
+//! is not halved, nor is an axis of one sample: thick slices keep their number until the other
+//! steps are as long. On a side with an odd number of samples, the last mean is over the samples
+//! that are left.
 
 use super::BLOCK_EDGE;
 use rayon::prelude::*;
@@ -27,8 +27,8 @@ pub fn halved_lattice(lattice: &Lattice) -> Option<Lattice> {
     Some(coarse)
 }
 
-/// Returns the lattices of all levels of a pyramid, up to one whose largest side is at most a block's
-/// edge, or that can't be halved.
+/// Returns the lattices of all levels of a pyramid, the finest first. The last one has no side
+/// longer than a block's edge, or can't be halved.
 pub fn level_lattices(lattice: &Lattice) -> Vec<Lattice> {
     let mut levels = vec![*lattice];
     while let Some(last) = levels.last()
@@ -46,8 +46,8 @@ fn halved_axes(lattice: &Lattice) -> [bool; 3] {
     std::array::from_fn(|a| dims[a] > 1 && spacing[a] < 2.0 * smallest)
 }
 
-/// Returns the next coarser level of a volume; `None` if no axis can be halved, or voxels have colours
-/// of their own: places in a palette have no mean. It keeps the summary of level 0.
+/// Returns the next coarser level of a volume, with the summary of level 0. `None` if no axis can
+/// be halved, or if voxels have colours of their own (places in a palette have no mean).
 ///
 /// Memory: the coarser samples, beside those of `fine`.
 pub fn coarser(fine: &Volume) -> Option<Volume> {
@@ -69,9 +69,9 @@ pub fn coarser(fine: &Volume) -> Option<Volume> {
     })
 }
 
-/// Returns the samples of the next coarser level of a box of samples, on all cores of rayon's pool.
-/// `fine` has samples on a box of `dims` samples of `lattice`, i fastest, which begins at an even
-/// index along each halved axis.
+/// Halves a box of samples, on all cores of rayon's pool. `fine` is a box of `dims` samples of
+/// `lattice`, i fastest; it begins at an even index along each halved axis. Returns its samples of
+/// the next coarser level, i fastest.
 ///
 /// # Panics
 /// If the samples and `dims` differ in number, or the lattice can't be halved.
@@ -86,8 +86,8 @@ pub fn halved(lattice: &Lattice, dims: [u32; 3], fine: &Samples) -> Samples {
     }
 }
 
-/// Calls `row` for each coarse row with the fine rows under it, in the order of z, then y, with
-/// whether x is halved, and with the coarse samples to write.
+/// Calls `row` for each coarse row, with the fine rows under it (in the order of z, then y),
+/// whether x is halved, and the coarse samples to write.
 fn rows<T: Copy + Default + Send + Sync>(
     axes: [bool; 3],
     dims: [u32; 3],
@@ -114,7 +114,8 @@ fn rows<T: Copy + Default + Send + Sync>(
     coarse
 }
 
-/// Means rounded half up. Eight codes of 16 bits add up to less than 2^19.
+/// Writes the means of a row of integers, rounded half up. Eight codes of 16 bits add up to less
+/// than 2^19.
 fn integer_row<T: Copy + Into<u32> + TryFrom<u32>>(under: &[&[T]], halve_x: bool, to: &mut [T]) {
     let mean = |sum: u32, n: u32| {
         T::try_from((sum + n / 2) / n).unwrap_or_else(|_| unreachable!("a mean of codes is a code"))
@@ -150,7 +151,8 @@ fn integer_row<T: Copy + Into<u32> + TryFrom<u32>>(under: &[&[T]], halve_x: bool
     }
 }
 
-/// Means of the finite samples; of samples without a finite one the first is taken.
+/// Writes the means of a row of floats over their finite samples. Without a finite sample, the
+/// first one is taken.
 fn float_row(under: &[&[f32]], halve_x: bool, to: &mut [f32]) {
     let in_row = if halve_x { 2 } else { 1 };
     for (x, to) in to.iter_mut().enumerate() {

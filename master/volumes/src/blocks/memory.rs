@@ -1,4 +1,4 @@
-//! A volume in memory as a source of boxes.
+//! Source of boxes from a volume in memory.
 
 use super::{BLOCK_EDGE, BlockSource, BlockSummaries, BlockSummary, ValueBins, block_dims};
 use crate::error::Problem;
@@ -7,7 +7,7 @@ use slabcast_common::volume::{Digest32, Samples, Volume, VolumeInfo};
 use std::ops::Deref;
 use std::sync::{Arc, OnceLock};
 
-/// One level: a volume whose samples are in memory. `V` owns or borrows it.
+/// Source with one level: a volume whose samples are in memory. `V` owns or borrows it.
 pub struct MemorySource<V = Arc<Volume>> {
     volume: V,
     level: VolumeInfo,
@@ -63,10 +63,10 @@ impl<V: Deref<Target = Volume> + Send + Sync> BlockSource for MemorySource<V> {
     }
 }
 
-/// Returns the samples of a box out of those of a lattice of `dims` samples, i fastest.
+/// Copies the box from `lo` to `hi` (exclusive) out of `dims` samples, i fastest.
 ///
 /// # Panics
-/// If the box is empty or reaches out.
+/// If the box is empty or reaches out of `dims`.
 pub(crate) fn copy_box(samples: &Samples, dims: [u32; 3], lo: [u32; 3], hi: [u32; 3]) -> Samples {
     assert!((0..3).all(|a| lo[a] < hi[a] && hi[a] <= dims[a]), "a box inside");
     fn rows<T: Copy>(all: &[T], dims: [u32; 3], lo: [u32; 3], hi: [u32; 3]) -> Vec<T> {

@@ -1,12 +1,13 @@
-//! Volumes read in boxes, at each level of a pyramid.
+//! Sources of volumes that are read in boxes, at each level of a pyramid.
 //!
-//! A [`BlockSource`] gives samples of a volume without holding all of them: whoever cuts bricks, frames
-//! a path or halves a volume asks for the box it needs. Level 0 is the volume; each level after
-//! it has means of two samples along each axis (`mean`). A level is a volume of its own, with a
-//! lattice, a digest and a summary.
+//! A [`BlockSource`] gives samples of a volume without holding all of them: code that cuts bricks,
+//! frames a path or halves a volume asks for the box that it needs. Level 0 is the volume; each
+//! level after it has means of two samples along each axis (`mean`). A level is a volume of its
+//! own, with a lattice, a digest and a summary.
 //!
-//! Blocks of [`BLOCK_EDGE`] samples an edge are the unit of summaries: what values a block holds is
-//! known without its samples, so that blocks a transfer function does not show are never read.
+//! Blocks of [`BLOCK_EDGE`] samples an edge are the unit of summaries. A summary tells the values
+//! of a block without its samples, so that blocks which a transfer function does not show are never
+//! read.
 
 #[cfg(feature = "zarr")]
 mod cascade;
@@ -49,7 +50,7 @@ pub use slabcast_common::value_bins::ValueBins;
 
 /// A volume whose samples are read box by box.
 ///
-/// Functions may read files: callers run on threads of their own.
+/// Methods may read files, so call them on threads that may block.
 pub trait BlockSource: Send + Sync {
     /// Returns the name for people, without folders.
     fn name(&self) -> &str;
@@ -64,32 +65,32 @@ pub trait BlockSource: Send + Sync {
     /// Returns the samples of the box from `lo` to `hi` (exclusive), i fastest.
     ///
     /// # Errors
-    /// A file that can't be read, or is damaged.
+    /// A file can't be read, or is damaged.
     ///
     /// # Panics
     /// If there is no such level, or the box is empty or reaches out of it.
     fn read_box(&self, level: usize, lo: [u32; 3], hi: [u32; 3]) -> Result<Samples, Problem>;
 
-    /// Returns what each block of a level holds.
+    /// Returns the block summaries of a level.
     ///
     /// # Errors
-    /// A file that can't be read, or is damaged.
+    /// A file can't be read, or is damaged.
     ///
     /// # Panics
     /// If there is no such level.
     fn summaries(&self, level: usize) -> Result<Arc<BlockSummaries>, Problem>;
 
-    /// Returns the bytes of memory that the source takes, or may come to take.
+    /// Returns the most bytes of memory that the source may take.
     fn memory_bytes(&self) -> u64;
 
-    /// Returns a level whose samples are all in memory; `None` of others.
+    /// Returns a level whose samples are all in memory; `None` for other levels.
     fn whole(&self, level: usize) -> Option<&Volume> {
         let _ = level;
         None
     }
 }
 
-/// Values that the samples of one block have.
+/// Summary of the values in one block.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BlockSummary {
     /// Bit `b` is set if some sample lies in bin `b` ([`ValueBins`]).
@@ -103,7 +104,7 @@ pub struct BlockSummary {
 pub struct BlockSummaries {
     /// Number of blocks along i, j, k.
     pub dims: [u32; 3],
-    /// Bins of the values.
+    /// Bins that the summaries refer to.
     pub bins: ValueBins,
     /// A summary for each block.
     pub all: Vec<BlockSummary>,
@@ -117,7 +118,7 @@ impl BlockSummaries {
 }
 
 impl BlockSummary {
-    /// Returns the summary of samples.
+    /// Returns the summary of a block's samples.
     pub fn of(samples: &Samples, bins: &ValueBins) -> BlockSummary {
         fn each<T: Copy + Into<f64>>(samples: &[T], bins: &ValueBins) -> BlockSummary {
             samples.iter().fold(BlockSummary { bins: 0, nan: false }, |all, &code| {
@@ -125,7 +126,7 @@ impl BlockSummary {
                 if code.is_nan() {
                     return BlockSummary { nan: true, ..all };
                 }
-                // A support shows infinities if it shows any code.
+                // Infinities count as the nearest finite code, which may be in any bin.
                 let seen = if code.is_infinite() { u64::MAX } else { 1 << bins.bin(code) };
                 BlockSummary { bins: all.bins | seen, ..all }
             })
@@ -144,7 +145,7 @@ impl BlockSummary {
     }
 }
 
-/// Returns the summaries of a level's blocks, each of which is read.
+/// Computes the block summaries of a level; reads all its samples.
 #[cfg(feature = "zarr")]
 pub(crate) fn summaries_of(
     source: &dyn BlockSource,

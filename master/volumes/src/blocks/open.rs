@@ -1,4 +1,4 @@
-//! Opens volumes that are read by blocks.
+//! Opens volumes of which blocks are read on request, and tells which volumes need that.
 
 use super::ome_zarr::{OmeZarrSource, OnProgress};
 use super::raw::RawSource;
@@ -8,18 +8,18 @@ use crate::{Hints, formula};
 use std::path::Path;
 use std::sync::Arc;
 
-/// Opens a volume whose blocks are read when they are asked for: a Zarr array or an OME-Zarr pyramid,
-/// an uncompressed file of raw numbers, NRRD, MetaImage or NIfTI, or a formula.
+/// Opens a volume of which blocks are read on request: a Zarr array or an OME-Zarr pyramid, an
+/// uncompressed file of raw numbers, NRRD, MetaImage or NIfTI, or a formula.
 ///
-/// What a pass over all samples finds out (digests, counts, what each block holds) is kept in `cache`, a
-/// folder. The first time, that pass takes as long as reading the file, and `on_progress` hears about it.
-/// Our own pyramids have it beside their samples.
+/// The first time, a pass reads all samples and finds digests, counts and block summaries.
+/// `on_progress` is called during it. The results are kept in the folder `cache` for later calls.
+/// Pyramids that slabcast wrote have them in their own folder and need no pass.
 ///
 /// A packed file is converted into `cache` first where `packed` says so. Notes for people are added to
 /// `notes`.
 ///
 /// # Errors
-/// A volume of another form, which has to be converted first; one that can't be read or is damaged; or
+/// The volume has another form and must be converted first; it can't be read or is damaged; or
 /// `on_progress` returned an error.
 pub fn open_source(
     path: &Path,
@@ -46,8 +46,8 @@ pub enum Packed {
 /// Bytes of samples from which a Zarr picture is read by blocks rather than as a whole.
 const LARGE_BYTES: u64 = 256 << 20;
 
-/// Returns whether a volume is better read by blocks ([`open_source`]) than as a whole: a Zarr picture
-/// with a finest level of more than 256 MiB, or a formula for tests of size.
+/// Returns whether a volume is better read by blocks ([`open_source`]) than as a whole: a Zarr
+/// picture with a finest level of more than 256 MiB, or a formula for tests of size.
 pub fn is_large(path: &Path, hints: &Hints) -> bool {
     if path.to_string_lossy().starts_with(FormulaSource::PREFIX) {
         return true;

@@ -1,7 +1,7 @@
-//! The numbers of a volume in order, from a file that is read again for each pass.
+//! Streams the numbers of a volume in order, as often as needed; each pass reads the file again.
 //!
-//! Files of every format that has its samples in order are read in pieces of 128 KiB, by a thread of
-//! their own. Others (DICOM, masks of VTK, Zarr) are read as a whole first.
+//! Formats with their samples in order are read in pieces of 128 KiB, by a thread of its own.
+//! Others (DICOM, masks of VTK, Zarr) are read as a whole first.
 
 use super::coding::{Coding, Form};
 use crate::error::Problem;
@@ -14,10 +14,10 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 
-/// Numbers between two calls of a pass over a volume in memory.
+/// Numbers for each call of `each` in a pass over a volume in memory.
 const STEP: usize = 1 << 16;
 
-/// A volume whose numbers can be had in order, as often as they are wanted.
+/// A volume whose numbers can be streamed in order, any number of times.
 pub(crate) struct Planes {
     /// Name for people, without folders.
     pub(crate) name: String,
@@ -30,7 +30,7 @@ pub(crate) struct Planes {
     pub(crate) number: Number,
     /// Map from numbers to values.
     pub(crate) rescale: ValueMap,
-    /// File and byte at which the numbers begin, and their byte order, if they lie there as they are.
+    /// Place of the numbers in the file, if they are stored uncompressed and in one piece.
     pub(crate) place: Option<Place>,
     /// Choices that the reader made, one sentence each.
     pub(crate) notes: Vec<String>,
@@ -108,8 +108,8 @@ impl Planes {
         }
     }
 
-    /// Returns the numbers of a volume in memory: the file's own if they were kept, else those that its
-    /// codes stand for.
+    /// Returns planes of a volume in memory. Their numbers are the file's own if `numbers` has
+    /// them, else the volume's codes as [`number_form`] writes them.
     pub(crate) fn in_memory(
         volume: Volume,
         numbers: Option<FileNumbers>,
@@ -135,7 +135,8 @@ impl Planes {
     /// Calls `each` with all numbers in order, i fastest, as little-endian bytes.
     ///
     /// # Errors
-    /// Those of `each`; a file that can't be read, is damaged, or changed since it was opened.
+    /// `each` returned an error; the file can't be read, is damaged, or changed since it was
+    /// opened.
     pub(crate) fn pass(
         &self,
         each: &mut dyn FnMut(&[u8]) -> Result<(), Problem>,
@@ -186,7 +187,7 @@ impl Planes {
                 each(&chunk)?;
                 let _ = chunks.spare.send(chunk);
             }
-            // A reader that still has chunks learns that nobody takes them.
+            // Dropping the receiver stops a reader that still has chunks to send.
             drop(chunks);
             let opened = reader.join().expect("panics were caught")?;
             let same = opened.volume.lattice == self.lattice && received == self.bytes();
@@ -195,7 +196,7 @@ impl Planes {
     }
 }
 
-/// Returns the error for a file that is another one than before.
+/// Returns the error for a file whose content changed between two passes.
 pub(crate) fn changed() -> Problem {
     Problem::new(
         crate::error::OpenErrorKind::Damaged,
@@ -205,7 +206,7 @@ pub(crate) fn changed() -> Problem {
     )
 }
 
-/// Returns some of the samples.
+/// Returns a copy of a range of samples.
 pub(crate) fn piece(samples: &Samples, range: std::ops::Range<usize>) -> Samples {
     match samples {
         Samples::U8(v) => Samples::U8(v[range].to_vec()),
@@ -214,8 +215,9 @@ pub(crate) fn piece(samples: &Samples, range: std::ops::Range<usize>) -> Samples
     }
 }
 
-/// Returns the numbers as which the codes of a volume in memory are written: the file's own integers
-/// if its codes are shifted ones, else the codes, with the map that makes values of them.
+/// Returns the number type, the form of the codes and the map from numbers to values with which a
+/// volume in memory is written: the file's own integers if its codes are shifted integers, else the
+/// codes themselves.
 fn number_form(volume: &Volume) -> (Number, Form, ValueMap) {
     let map = volume.summary.map;
     let kept = ValueMap::IDENTITY;
@@ -243,7 +245,7 @@ fn number_form(volume: &Volume) -> (Number, Form, ValueMap) {
     }
 }
 
-/// Returns the bytes of a box out of numbers of `size` bytes on `dims` samples, i fastest.
+/// Copies a box out of a volume of `dims` numbers of `size` bytes, i fastest.
 pub(crate) fn cut_bytes(
     all: &[u8],
     size: usize,

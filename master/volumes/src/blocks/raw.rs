@@ -1,5 +1,5 @@
-//! A file whose samples lie in it as they are, as a source of boxes: raw numbers, NRRD, MetaImage and
-//! NIfTI without compression. It has one level.
+//! Source of boxes from an uncompressed file: raw numbers, NRRD, MetaImage or NIfTI. It has one
+//! level.
 
 use super::coding::Coding;
 use super::ome_zarr::{OnProgress, blocks_again, infos, walk};
@@ -17,12 +17,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Bytes at both ends of a file that tell it from others.
+/// Bytes at each end of a file that its identity is computed from.
 const ENDS_BYTES: u64 = 64 << 10;
-/// Most bytes that are read at a time where rows lie apart: at 1 GB/s as long as 50 calls.
+/// Most bytes that one call reads where the rows of a box lie apart: at 1 GB/s it takes as long as
+/// 50 calls.
 const SPAN_BYTES: u64 = 64 << 10;
 
-/// A file that is read by offsets.
+/// An uncompressed file whose boxes are read by their offsets.
 pub struct RawSource {
     name: String,
     file_type: String,
@@ -43,9 +44,9 @@ pub(super) fn stamp(file: &File) -> Result<(u64, Option<SystemTime>), Problem> {
 }
 
 impl RawSource {
-    /// Opens a file. What is known of its blocks comes from the sidecar in `cache`; without one, all
-    /// samples are read once, which `on_progress` hears about, and a sidecar is put into `cache`.
-    /// `None` for a file whose samples are packed, or lie in several places.
+    /// Opens a file; `None` if its samples are compressed or lie in several places. Block summaries
+    /// come from the sidecar in `cache`. Without one, a pass reads all samples, calls
+    /// `on_progress`, and writes a sidecar into `cache`.
     ///
     /// # Errors
     /// The file can't be read or is damaged; `on_progress` returned an error.
@@ -85,7 +86,7 @@ impl RawSource {
             }
         };
         if let Some(path) = &beside {
-            // A cache that can't be written is none.
+            // Without a writable cache the next run surveys the file again.
             let _ = facts.write(path, &identity);
         }
         Ok(Some(source(&facts, file)))
@@ -100,7 +101,7 @@ impl RawSource {
         let mut out = Vec::new();
         crate::samples::reserve(&mut out, (count * size) as usize)?;
         let (row, stride) = (width * size, nx * size);
-        // Rows that lie close are read with what lies between them.
+        // Rows that lie close are read in one call, with the bytes between them.
         let at_once = if stride <= 4 * row { height } else { (SPAN_BYTES / stride).max(1) };
         for z in lo[2]..hi[2] {
             let mut y = u64::from(lo[1]);
@@ -147,7 +148,7 @@ impl BlockSource for RawSource {
         let dims = self.levels[level].lattice.dims;
         assert!((0..3).all(|a| lo[a] < hi[a] && hi[a] <= dims[a]), "a box inside");
         let numbers = self.numbers(lo, hi)?;
-        // After reading: what came may be of two files.
+        // Checked after reading: a file replaced meanwhile gives bytes of both files.
         if stamp(&self.file)? != self.stamp {
             return Err(replaced("file"));
         }
@@ -166,7 +167,8 @@ impl BlockSource for RawSource {
     }
 }
 
-/// Returns what tells a file from others: size, time, its ends, and what its header says.
+/// Returns the identity of a file: a digest of its size, its time of change, both ends, and the
+/// facts of its header.
 fn identity(
     planes: &Planes,
     (file, start, endian): (&File, u64, Endian),

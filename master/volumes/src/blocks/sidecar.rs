@@ -1,9 +1,11 @@
-//! What a pass over a volume found out, kept in a file: digests, counts, and the bins of each block.
+//! Sidecar files: digests, counts and block summaries that a pass over a volume found, kept so that
+//! the pass happens once.
 //!
-//! A sidecar lies in the cache, or in the folder of a pyramid that we wrote. It begins with a line of
-//! text and a version, then a JSON head with its length, then the summaries of all blocks, and ends with
-//! a SHA-256 of all before it. It belongs to the files whose [`Identity`] it has. A sidecar that is
-//! damaged, of another version, or of other files is as good as none.
+//! A sidecar lies in the cache, or in the folder of a pyramid that slabcast wrote. It holds, in
+//! this order: a line of text with the version, the length of a JSON head and the head, the
+//! summaries of all blocks, and a SHA-256 of all before it. It belongs to the files whose
+//! [`Identity`] it has. A sidecar that is damaged, of another version, or of other files counts as
+//! missing.
 
 use super::coding::{Coding, Form};
 use super::{BlockSummaries, BlockSummary, ValueBins, block_dims};
@@ -15,22 +17,23 @@ use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// First bytes; the number is the version.
+/// First bytes of a sidecar; the number is the version.
 const MAGIC: &[u8; 20] = b"slabcast sidecar 1\n\0";
 /// Most bytes of the JSON head.
 const HEAD_MAX_BYTES: u64 = 4 << 20;
 
-/// SHA-256 over what tells files from others: names, sizes, times, and their metadata.
+/// SHA-256 that tells the files of a volume from others: over names, sizes, times of change, and
+/// metadata.
 pub(crate) type Identity = [u8; 32];
 
-/// Digest and blocks of one level.
+/// Digest and block summaries of one level.
 #[derive(Clone, Debug)]
 pub(crate) struct LevelFacts {
     pub(crate) digest: Digest32,
     pub(crate) blocks: Arc<BlockSummaries>,
 }
 
-/// What is known of a volume and its levels.
+/// Results of a pass over a volume: coding, summary, and the facts of each level.
 #[derive(Clone, Debug)]
 pub(crate) struct Facts {
     pub(crate) coding: Coding,
@@ -40,10 +43,10 @@ pub(crate) struct Facts {
 }
 
 impl Facts {
-    /// Writes a sidecar, whole or not at all.
+    /// Writes a sidecar atomically, and the folder for it.
     ///
     /// # Errors
-    /// The folder can't be made, or the file not be written.
+    /// The folder or the file can't be written.
     pub(crate) fn write(&self, path: &Path, identity: &Identity) -> std::io::Result<()> {
         let folder = path.parent().unwrap_or(Path::new("."));
         std::fs::create_dir_all(folder)?;
@@ -90,8 +93,8 @@ impl Facts {
         Ok(())
     }
 
-    /// Reads the sidecar of levels on these lattices; `None` if there is none that is whole and has
-    /// this identity.
+    /// Reads the sidecar of levels on these lattices. `None` if the file is missing, damaged, or
+    /// has another identity.
     pub(crate) fn read(path: &Path, identity: &Identity, lattices: &[Lattice]) -> Option<Facts> {
         let mut file = std::io::BufReader::new(std::fs::File::open(path).ok()?);
         let mut hash = Sha256::new();
@@ -124,7 +127,7 @@ impl Facts {
         for ((lattice, digest), bins) in lattices.iter().zip(digests).zip(bins) {
             let dims = block_dims(lattice.dims);
             let count: u64 = dims.iter().map(|&n| u64::from(n)).product();
-            // Read as far as the file goes, so that no size takes memory before its bytes are there.
+            // Memory grows with the bytes that are read, so a false count can't demand it.
             let bytes = next(count.checked_mul(9)?)?;
             let all = bytes.chunks_exact(9).map(|block| BlockSummary {
                 bins: u64::from_le_bytes(block[..8].try_into().expect("eight bytes")),
@@ -158,7 +161,7 @@ impl<W: Write> HashWriter<W> {
     }
 }
 
-/// Returns the place of a sidecar in a cache folder.
+/// Returns the path of a sidecar in a cache folder.
 pub(crate) fn in_cache(cache: &Path, identity: &Identity) -> PathBuf {
     cache.join("volumes").join(format!("{}.blocks", Digest32(*identity)))
 }
@@ -176,7 +179,7 @@ fn coding_to_json(coding: &Coding) -> Value {
         Form::Same => json!({"form": "same"}),
         Form::Flipped => json!({"form": "flipped"}),
         Form::Floats { limit } => json!({"form": "floats", "limit": limit}),
-        // JSON has no integers of 65 bits.
+        // Written as texts: the range of i64 and u64 together has 65 bits, JSON's integers have 64.
         Form::Integers { min, max } => {
             json!({"form": "integers", "min": min.to_string(), "max": max.to_string()})
         }
@@ -198,7 +201,7 @@ fn coding_from_json(json: &Value) -> Option<Coding> {
         ("floats", Number::F32) => Form::Floats { limit: by["limit"].as_f64() },
         ("integers", n) if wide && n.limits().is_some() => {
             let (min, max) = (integer(&by["min"])?, integer(&by["max"])?);
-            // Of 64 bits.
+            // Refuses numbers that neither i64 nor u64 holds.
             let least = i128::from(i64::MIN);
             (least <= min && min <= max && max <= i128::from(u64::MAX))
                 .then_some(Form::Integers { min, max })?

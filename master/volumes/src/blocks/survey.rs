@@ -1,4 +1,5 @@
-//! What one pass over a level finds out: its digest, counts of its values, and what each block holds.
+//! Survey of a level: one pass that finds its digest, the counts of its values, and the bins that
+//! each block holds.
 
 use super::memory::copy_box;
 use super::{BLOCK_EDGE, BlockSummaries, BlockSummary, ValueBins, block_dims};
@@ -10,20 +11,21 @@ use slabcast_common::volume::{
 };
 use std::sync::{Mutex, PoisonError};
 
-/// Most bytes for the codes of 16 bits that blocks hold. Blocks of noise take 8 KiB each, of a scan
-/// some 500 bytes.
+/// Most bytes for the sets of 16-bit codes that blocks hold. A block of noise takes 8 KiB, a block
+/// of a scan some 500 bytes.
 const WORDS_MAX_BYTES: usize = 64 << 20;
 
 /// Counts of the values of level 0.
 pub(crate) enum Counter {
     /// One count for each code of 8 or 16 bits.
     Codes { kind: SampleKind, counts: Vec<u64> },
-    /// Floats between the smallest and the largest.
+    /// Histogram of floats between the smallest and the largest code.
     Floats { summary: ValueSummary },
 }
 
 impl Counter {
-    /// Returns a counter of nothing. Floats need their smallest and largest finite code.
+    /// Returns an empty counter. `range` is the smallest and the largest finite code; only floats
+    /// need it.
     pub(crate) fn new(kind: SampleKind, map: ValueMap, range: (f64, f64)) -> Counter {
         match kind {
             SampleKind::F32 => Counter::Floats {
@@ -52,8 +54,8 @@ impl Counter {
         }
     }
 
-    /// Returns the summary of all values that were counted; `recount` counts the finite codes between
-    /// two again ([`ValueSummary::find_core`]).
+    /// Returns the summary of all values that were counted. `recount` counts the finite codes
+    /// between two codes in another pass, for [`ValueSummary::find_core`].
     pub(crate) fn summary(
         self,
         map: ValueMap,
@@ -71,7 +73,8 @@ impl Counter {
     }
 }
 
-/// Counts the finite codes of a piece between two codes.
+/// Adds the finite codes of a piece to `histogram`, in the bins of [`ValueSummary::core_bin`]
+/// between two codes.
 pub(crate) fn count_between(codes: &Samples, lo: f64, hi: f64, histogram: &mut [u64]) {
     let mut count = |code: f64| histogram[ValueSummary::core_bin(code, lo, hi)] += 1;
     match codes {
@@ -87,17 +90,17 @@ struct FloatCounts {
     infinite: u64,
 }
 
-/// The codes that a block holds, while the bins are not known yet.
+/// Set of the codes that a block holds, kept until the bins are known.
 enum Held {
-    /// A bit for each code of 8 bits.
+    /// 8-bit codes: one bit for each.
     Bytes([u64; 4]),
-    /// Bits of the codes of 16 bits from 64 `first` on.
+    /// 16-bit codes: one bit for each, beginning with code 64 `first`.
     Words { first: u16, bits: Box<[u64]> },
-    /// Bins that were guessed.
+    /// Floats: their summary in the guessed bins.
     Floats(BlockSummary),
 }
 
-/// Scratch memory of a thread.
+/// Scratch memory of a thread that looks at blocks.
 pub(crate) struct Scratch(Vec<u32>);
 
 impl Scratch {
@@ -106,7 +109,7 @@ impl Scratch {
     }
 }
 
-/// A level whose slabs are looked at in order.
+/// Survey of a level in progress. Slabs of 64 planes are added in order.
 pub(crate) struct Survey {
     lattice: Lattice,
     hasher: VolumeHasher,
@@ -117,7 +120,7 @@ pub(crate) struct Survey {
     counter: Option<Mutex<Counter>>,
 }
 
-/// What the survey of a level found.
+/// Result of the survey of a level.
 pub(crate) struct Surveyed {
     hasher: VolumeHasher,
     held: Option<Vec<Held>>,
@@ -127,8 +130,8 @@ pub(crate) struct Surveyed {
 }
 
 impl Survey {
-    /// Starts with a level on `lattice`; `guess` are the likely bins of floats. A counter is for level
-    /// 0.
+    /// Begins the survey of a level on `lattice`. `guess` are the likely bins of floats. Level 0
+    /// has a counter.
     pub(crate) fn new(
         lattice: Lattice,
         (map, kind): (ValueMap, SampleKind),
@@ -145,9 +148,14 @@ impl Survey {
         }
     }
 
-    /// Looks at the next planes of the level, 64 of them or those that are left. Calls `beside` with
-    /// each block's box in the slab and its samples, on several threads, and returns what it gave, i
-    /// fastest.
+    /// Surveys the next slab of the level: 64 planes, or the rest.
+    ///
+    /// Calls `beside` with the box of each block within the slab and its samples, on several
+    /// threads. Then calls `take` with the results of each square of [`SQUARE`] x `SQUARE` blocks:
+    /// the square's position, and the results, i fastest.
+    ///
+    /// # Errors
+    /// `take` returned an error, or memory ran out.
     pub(crate) fn slab<T: Send>(
         &mut self,
         codes: &Samples,
@@ -169,7 +177,7 @@ impl Survey {
         let mut all: Vec<Option<Held>> = Vec::new();
         all.resize_with(grid[0] as usize * grid[1] as usize, || None);
         let blocks = || -> Result<(), Problem> {
-            // Squares of blocks, so that few results wait at a time.
+            // One square at a time, so that few results are in memory.
             for y in (0..grid[1]).step_by(SQUARE as usize) {
                 for x in (0..grid[0]).step_by(SQUARE as usize) {
                     let (w, h) = (SQUARE.min(grid[0] - x), SQUARE.min(grid[1] - y));
@@ -208,7 +216,7 @@ impl Survey {
         Ok(())
     }
 
-    /// Returns what was found in all slabs.
+    /// Ends the survey after the last slab.
     pub(crate) fn finish(self) -> Surveyed {
         Surveyed {
             hasher: self.hasher,
@@ -220,7 +228,7 @@ impl Survey {
     }
 }
 
-/// Blocks along an edge of the square whose results are taken at a time, and of a shard.
+/// Blocks along an edge of a square of results, and of a shard.
 pub(crate) const SQUARE: u32 = 8;
 
 fn reserve_more<T>(to: &mut Vec<T>, more: usize) -> Result<(), Problem> {
@@ -232,7 +240,8 @@ fn reserve_more<T>(to: &mut Vec<T>, more: usize) -> Result<(), Problem> {
 }
 
 impl Surveyed {
-    /// Returns the digest of level number `level` of a volume, of whose level 0 vox and summary are.
+    /// Returns the digest of the level, number `level` of its volume. `finest_vox` and `summary`
+    /// are the vox and the summary of level 0.
     pub(crate) fn digest(&self, level: u32, finest_vox: f64, summary: &ValueSummary) -> Digest32 {
         let hasher = self.hasher.clone();
         match level {
@@ -241,12 +250,13 @@ impl Surveyed {
         }
     }
 
-    /// Returns the counter of level 0, once.
+    /// Takes the counter of level 0; `None` for other levels and after the first call.
     pub(crate) fn take_counter(&mut self) -> Option<Counter> {
         self.counter.take()
     }
 
-    /// Returns what each block holds; `None` if the guessed bins were others, or memory did not do.
+    /// Returns the block summaries in `bins`. `None` if floats were put into other, guessed bins,
+    /// or the sets of codes took too much memory.
     pub(crate) fn blocks(&self, bins: ValueBins) -> Option<BlockSummaries> {
         let table: Vec<u8> = match self.held.as_ref()?.first() {
             Some(Held::Bytes(_)) => (0..256).map(|c| bins.bin(c.into()) as u8).collect(),
@@ -289,7 +299,8 @@ fn held(
     };
     match samples {
         Samples::U8(v) => {
-            // Four tables, since in a run of air each count would wait for the one before.
+            // Four tables, since in a run of equal codes (air) each count would wait for the one
+            // before.
             let mut tables = [[0u32; 256]; 4];
             let mut fours = v.chunks_exact(4);
             for four in &mut fours {

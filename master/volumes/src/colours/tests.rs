@@ -121,7 +121,7 @@ fn vti(channels: usize, active: &str, data: &[u8]) -> Vec<u8> {
     .into_bytes()
 }
 
-/// A TIFF of three pages.
+/// Returns a TIFF of three pages.
 fn tiff<C: tiff::encoder::colortype::ColorType<Inner = T>, T: Copy>(
     channels: usize,
     number: fn(u8) -> T,

@@ -50,7 +50,8 @@ pub(super) const KEPT: [(Tag, &str); 28] = [
 
 /// Longest value that is kept; six numbers of 16 characters take 101 bytes.
 pub(super) const VALUE_MAX_BYTES: u32 = 1024;
-/// Longest GridFrameOffsetVector: 16 characters for each of 4096 frames, the most of 16 bits of length.
+/// Longest GridFrameOffsetVector: 16 characters for each of 4096 frames, the most of 16 bits of
+/// length.
 const OFFSETS_MAX_BYTES: u32 = 1 << 16;
 /// Most bytes before the pixels: private elements can hold whole reports.
 const HEADER_MAX_BYTES: u64 = 64 << 20;
@@ -61,21 +62,22 @@ const DEPTH_MAX: u32 = 64;
 /// Length of an element that a delimiter ends.
 pub(super) const UNDEFINED: u32 = u32::MAX;
 
-/// How pixels are stored.
+/// Storage of pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Pixels {
     /// Uncompressed.
     Native {
         /// Bytes of the element.
         bytes: u64,
-        /// Whether the pixels are 16-bit words (VR OW), whose bytes are swapped in big-endian files.
+        /// Whether the pixels are 16-bit words (VR OW), whose bytes are swapped in big-endian
+        /// files.
         words: bool,
     },
     /// Encoded, in fragments.
     Packed(Packing),
 }
 
-/// How pixels in fragments are encoded.
+/// Encoding of pixels in fragments.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Packing {
     /// Run lengths.
@@ -104,7 +106,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
     head.get(128..132) == Some(b"DICM") || bare && head.len() > 8
 }
 
-/// How elements are encoded: with or without their types, and in which byte order.
+/// Encoding of elements: with or without their types, and the byte order.
 #[derive(Clone, Copy)]
 pub(super) struct Syntax {
     explicit: bool,
@@ -179,7 +181,8 @@ impl File {
         {
             syntax.explicit = true;
         }
-        // Some programs write the pixels in JPEG and the elements without types, unlike the standard.
+        // Some programs write the pixels in JPEG and the elements without types, unlike the
+        // standard.
         if part10 && syntax.endian == Endian::Little && !deflated {
             syntax.explicit = reader.has_types()?.unwrap_or(syntax.explicit);
         }
@@ -377,7 +380,8 @@ impl ElementReader {
     }
 
     /// Reads an element, and keeps or skips its value. Returns the length of the pixels, and
-    /// whether they are 16-bit words, if they come next. `len` is the most bytes that the file can have.
+    /// whether they are 16-bit words, if they come next. `len` is the most bytes that the file can
+    /// have.
     fn element(
         &mut self,
         s: Syntax,

@@ -1,5 +1,5 @@
-//! Files of several frames: what the functional groups of enhanced CT, MR and PET say of each frame,
-//! or the offsets of a dose, and where its pixels are. Each frame then counts as a slice.
+//! Files of several frames: what the functional groups of enhanced CT, MR and PET say of each
+//! frame, or the offsets of a dose, and where its pixels are. Each frame then counts as a slice.
 
 use super::elements::{ElementReader, File, KEPT, Pixels, Syntax, Tag, UNDEFINED, VALUE_MAX_BYTES};
 use crate::error::{OpenErrorKind, Problem};
@@ -197,8 +197,8 @@ pub(super) fn frames(file: &mut File) -> Result<Vec<Frame>, Problem> {
     Ok(places.into_iter().enumerate().map(frame).collect())
 }
 
-/// Returns first byte and length of each frame's fragments, by the table of offsets, or if there is a
-/// fragment for each. `start` is the place of the first item.
+/// Returns first byte and length of each frame's fragments, by the table of offsets, or if there is
+/// a fragment for each. `start` is the place of the first item.
 fn fragments(rest: &mut dyn Read, start: u64, count: usize) -> Result<Vec<(u64, u64)>, Problem> {
     let bad =
         |what: &str| Problem::new(OpenErrorKind::Damaged, "PixelData", what, "get the file again");
@@ -221,7 +221,7 @@ fn fragments(rest: &mut dyn Read, start: u64, count: usize) -> Result<Vec<(u64, 
     rest.take(bytes.into()).read_to_end(&mut table).map_err(|e| Problem::io("PixelData", &e))?;
     at += 8 + u64::from(bytes);
     let first = at;
-    // Where items begin, and where the last one ends.
+    // Offset of each item, and the end of the last one.
     let mut items = vec![first];
     while let Some(bytes) = next(rest)? {
         match crate::source::skip_bytes(rest, bytes.into()) {
@@ -258,7 +258,7 @@ fn fragments(rest: &mut dyn Read, start: u64, count: usize) -> Result<Vec<(u64, 
 }
 
 impl File {
-    /// Makes the file's values those of a frame.
+    /// Sets the file's values to a frame's.
     pub(super) fn select(&mut self, frame: &Frame) {
         let groups = &self.groups;
         let own = groups.frames.get(frame.index).into_iter().flatten();

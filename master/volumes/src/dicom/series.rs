@@ -31,7 +31,7 @@ struct Slice {
     thickness_note: Option<String>,
     /// Bytes of uncompressed pixels; `None` where they are packed.
     native_bytes: Option<u64>,
-    /// Where the pixels are in a file of several frames.
+    /// Place of the pixels in a file of several frames.
     frame: Option<frames::Frame>,
     /// Whether the stored numbers are indices of a palette.
     palette: bool,
@@ -384,7 +384,7 @@ impl Slice {
             None => file.numbers::<2>((0x0018, 0x1164))?.unwrap_or([1.0; 2]),
         };
         let positive = |x: f64| if x > 0.0 { x } else { 1.0 };
-        // Where positions give the step these do not matter, so that no wording of them is refused.
+        // Positions may give the step, so a malformed spacing or thickness is not refused here.
         let mut thickness_note = None;
         let mut thick = None;
         for tag in [(0x0018, 0x0088), (0x0018, 0x0050)] {
@@ -412,7 +412,7 @@ impl Slice {
             let column = DVec3::new(d[3], d[4], d[5]) * spacing[1];
             (DVec3::from_array(p), [row, column])
         });
-        // Of a dose, the grid's scale.
+        // A dose has its grid's scale in place of a slope.
         let slope = match file.numbers::<1>((0x0028, 0x1053))? {
             None => file.numbers::<1>((0x3004, 0x000e))?,
             slope => slope,
@@ -475,8 +475,8 @@ fn leading_number(text: &str) -> Option<f64> {
     longest.filter(|x| x.is_finite())
 }
 
-/// Sorts the slices, checks that they agree, and returns the preface with their lattice, and how many
-/// slices are missing after each; nothing if none is.
+/// Sorts the slices, checks that they agree, and returns the preface with their lattice, and how
+/// many slices are missing after each; nothing if none is.
 fn arrange(
     series: &mut Series,
     pick: &Pick,

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// How long a process may go on after its pipes are closed.
+/// Longest time that a process may go on after its pipes are closed.
 const END: Duration = Duration::from_secs(1);
 
 /// A running child process; dropping it kills and reaps it.

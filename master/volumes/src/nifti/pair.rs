@@ -1,5 +1,5 @@
-//! Reader of pairs: the header in `NAME.hdr`, the samples in `NAME.img`, either also in gzip. They are
-//! NIfTI-1, NIfTI-2, or ANALYZE 7.5, from which NIfTI-1 took its fields.
+//! Reader of pairs: the header in `NAME.hdr`, the samples in `NAME.img`, either also in gzip. They
+//! are NIfTI-1, NIfTI-2, or ANALYZE 7.5, from which NIfTI-1 took its fields.
 //!
 //! ANALYZE does not say where left is. Like nibabel, SPM and FSL this reader takes x to the left, y
 //! to anterior and z to superior where the field `orient` is 0, and places the origin where SPM's
@@ -17,8 +17,8 @@ use std::path::Path;
 /// Size of a header of NIfTI-1 and ANALYZE.
 const HEADER_1_BYTES: usize = 348;
 
-/// Returns whether the first bytes, after decompression, are the header of a pair: that of NIfTI or
-/// ANALYZE, and not of one file.
+/// Returns whether the first bytes, after decompression, are the header of a pair of files (NIfTI
+/// or ANALYZE), and not of a single file.
 pub(crate) fn sniff(start: &[u8]) -> bool {
     let Some(size) = start.first_chunk::<4>() else { return false };
     let is = |n: u32| u32::from_le_bytes(*size) == n || u32::from_be_bytes(*size) == n;
@@ -51,7 +51,7 @@ pub(crate) fn read(
     let data = data_beside(folder, name)?.ok_or_else(|| no_data(name, nifti, magic))?;
     let mut header = Header::fields(bytes, endian);
     if !nifti {
-        // What ANALYZE keeps in their places has another meaning.
+        // ANALYZE has fields of another meaning in the places of these.
         (header.qform_code, header.sform_code, header.inter, header.units) = (0, 0, 0.0, 2);
     }
     let (layout, part, said) = header.layout(endian, pick).map_err(|p| match nifti {
@@ -92,8 +92,8 @@ pub(crate) fn read(
     header.volume(name, anatomical, &layout, lattice, (samples, stored), &beside)
 }
 
-/// Returns the name of a header's file of samples without its end, and whether its end is in
-/// capitals; `None` if the name is not that of a header.
+/// Returns a header's name without its ending, and whether the ending is in capitals; `None` if the
+/// name is not a header's. The file of samples has the same stem.
 fn stem(name: &str) -> Option<(&str, bool)> {
     let lower = name.to_ascii_lowercase();
     let end = [".hdr", ".hdr.gz"].iter().find(|end| lower.ends_with(**end))?;

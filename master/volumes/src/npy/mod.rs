@@ -25,7 +25,7 @@ pub(crate) const ZIP: &[u8] = b"PK\x03\x04";
 
 /// Longest header: NumPy itself reads 10,000 bytes unless told to trust the file.
 const HEADER_MAX_BYTES: usize = 1 << 16;
-/// Most files of an archive that are looked at.
+/// Most files of an archive that are searched for arrays.
 const MEMBERS_MAX: usize = 10_000;
 
 /// Reads an array from the start of a source; `gzip` says that it is compressed.
@@ -136,7 +136,7 @@ pub(crate) fn read_archive(
     volume(name, &array, layout, samples, map, hints)
 }
 
-/// Returns the error for an archive without arrays; `names` are those of its files.
+/// Returns the error for an archive without arrays; `names` are the names of its files.
 fn no_array(names: &[String]) -> Problem {
     let is_zarr = |n: &String| {
         [".zarray", ".zgroup", "zarr.json"].iter().any(|meta| n.rsplit('/').next() == Some(*meta))
@@ -333,7 +333,8 @@ impl Array {
     }
 }
 
-/// Returns the refusal of a type that is not a number, which `descr` names `name` after the byte order.
+/// Returns the refusal of a type that is not a number, which `descr` names `name` after the byte
+/// order.
 fn unread_type(descr: &str, name: &str) -> Problem {
     let what = match name.chars().next() {
         Some('O') => "Python objects, which can run programs",

@@ -3,7 +3,7 @@ use crate::fuzz::gzip;
 use std::io::{Cursor, Write};
 use std::path::Path;
 
-/// An array of the numbers 0, 1, 2, ... in the order of memory.
+/// Returns an array of the numbers 0, 1, 2, ... in the order of memory.
 pub(crate) fn npy(version: u8, descr: &str, fortran: bool, shape: &str) -> Vec<u8> {
     let fortran = if fortran { "True" } else { "False" };
     let mut text =
@@ -46,7 +46,7 @@ pub(crate) fn npy(version: u8, descr: &str, fortran: bool, shape: &str) -> Vec<u
     out
 }
 
-/// A zip archive of these files.
+/// Returns a zip archive of these files.
 pub(crate) fn archive(files: &[(&str, &[u8])], packed: bool) -> Vec<u8> {
     let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
     let method = if packed { CompressionMethod::Deflated } else { CompressionMethod::Stored };

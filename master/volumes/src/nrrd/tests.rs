@@ -95,7 +95,7 @@ fn nrrd_axes_of_colours_vectors_and_time_are_no_axes_of_space() {
         let say =
             format!("kinds (line 6): the first axis of 3 x 2 x 1 is no axis of space: `{kind}`");
         assert!(e.contains(&say) && e.contains("save one of its components"), "{e}");
-        // What it says also works.
+        // The remedy in the message works.
         assert!(open(&head("3 2 1", "kinds: domain domain domain\n"), &[0; 6]).is_ok());
     }
     for (sizes, more, say) in [

@@ -1,9 +1,9 @@
 //! Reader of stacks of PNG and JPEG pictures: the files of a folder, in the order of the numbers in
 //! their names, become slices.
 //!
-//! A picture is grey, or has colours of which red, green and blue are equal in every pixel; of others one
-//! channel is read. The values are those that are stored: a PNG of one bit holds 0 and 1. Pictures have
-//! no spacing; it comes from `--spacing`.
+//! A picture is read as grey if red, green and blue are equal in every pixel. From other pictures
+//! one channel is read. Values are taken as stored: a PNG of one bit holds 0 and 1. Pictures have
+//! no spacing; `--spacing` gives it.
 
 pub(crate) mod jpeg;
 mod png;
@@ -37,7 +37,7 @@ pub(crate) fn is_jpeg(head: &[u8]) -> bool {
     head.starts_with(b"\xff\xd8\xff")
 }
 
-/// Returns width and height of a picture by its first bytes, as far as these tell.
+/// Returns width and height of a picture from its first bytes; `None` if these do not hold them.
 pub(crate) fn size(head: &[u8]) -> Option<(u32, u32)> {
     if is_jpeg(head) {
         let frame = jpeg::Frame::find(head).ok()?;
@@ -104,7 +104,7 @@ impl Picture {
         }
     }
 
-    /// Returns the colours that its pixels are numbers of, if it has some that are not grey.
+    /// Returns the palette that pixels index, if it has a colour that is not grey.
     fn palette(&self) -> Option<&[u8]> {
         match self {
             Picture::Png(png) => png.palette.as_deref(),
@@ -112,7 +112,7 @@ impl Picture {
         }
     }
 
-    /// Returns the numbers of a pixel that are colours and opacity: 1 to 4.
+    /// Returns the count of numbers in a pixel, 1 to 4: grey or three colours, and opacity.
     fn channels(&self) -> u64 {
         match self {
             Picture::Png(png) => png.channels(),
@@ -120,7 +120,8 @@ impl Picture {
         }
     }
 
-    /// Writes the samples of the next rows, big-endian: of one channel, or of all that are grey.
+    /// Appends the samples of the next rows to `out`, big-endian: of one channel, or their grey
+    /// value without `channel`.
     fn rows(&mut self, channel: Option<Channel>, out: &mut Vec<u8>) -> Result<(), Problem> {
         match self {
             Picture::Png(png) => png.row(channel, out),
@@ -139,24 +140,25 @@ fn colours(channels: usize) -> Problem {
     Problem { colours: Some(if channels == 4 { 4 } else { 3 }), ..problem }
 }
 
-/// Returns the numbers of a pixel that two pictures of a stack have together. One with opacity makes all
-/// have it, and so do colours.
+/// Returns the count of numbers in a pixel that has all channels of two pictures of a stack, `a`
+/// and `b` numbers. If one has opacity or colours, the stack has them.
 fn together(a: u64, b: u64) -> u64 {
     let is_alpha = a.is_multiple_of(2) || b.is_multiple_of(2);
     if a.max(b) < 3 { a.max(b) } else { 3 + u64::from(is_alpha) }
 }
 
-/// A number of each pixel that is read of a stack.
+/// Channel that is read from each picture of a stack.
 #[derive(Clone, Copy)]
 struct Channel {
     index: u64,
-    /// Numbers of a pixel that the stack's pictures have together: grey, grey and opacity, three
-    /// colours, or those and opacity.
+    /// Count of numbers in a pixel of the stack: 1 is grey, 2 grey and opacity, 3 colours, 4
+    /// colours and opacity.
     of: u64,
 }
 
 impl Channel {
-    /// Returns the index among the `channels` numbers of one picture's pixels; `None` is full opacity.
+    /// Returns the channel's index among the `channels` numbers of one picture's pixels; `None` if
+    /// it is the opacity and this picture has none, which counts as opaque.
     fn within(self, channels: usize) -> Option<usize> {
         if self.of.is_multiple_of(2) && self.index == self.of - 1 {
             return channels.is_multiple_of(2).then(|| channels - 1);
@@ -165,8 +167,12 @@ impl Channel {
     }
 }
 
-/// Writes one channel of pixels of `channels` numbers of `size` bytes (one, grey and opacity, three
-/// colours, or those and opacity), or their grey. Returns whether all are opaque, or it matters not.
+/// Appends one channel of pixels to `out`, or their grey value without a channel. A pixel has
+/// `channels` numbers of `size` bytes: grey, grey and opacity, three colours, or colours and
+/// opacity. Returns false if a grey value was taken from a pixel that is not opaque.
+///
+/// # Errors
+/// Without a channel: a pixel's red, green and blue differ.
 fn push(
     pixels: &[u8],
     (channels, size): (usize, usize),
@@ -178,7 +184,7 @@ fn push(
         for pixel in pixels.chunks_exact(channels * size) {
             match number {
                 Some(i) => out.extend_from_slice(&pixel[i * size..(i + 1) * size]),
-                // What has no opacity of its own is opaque.
+                // A picture without opacity is opaque.
                 None => out.extend(std::iter::repeat_n(0xff, size)),
             }
         }
@@ -202,7 +208,8 @@ fn push(
     if grey { Ok(opaque) } else { Err(colours(channels)) }
 }
 
-/// Reads pictures, in the order given, as slices of a volume called `name`, of at most `cap`.
+/// Reads pictures, in the order given, as slices of a volume called `name`. Its samples take at
+/// most `cap`.
 pub(crate) fn read_files(
     files: Vec<PathBuf>,
     name: &str,
@@ -241,7 +248,7 @@ pub(crate) fn read_files(
         }
     }
     let (shape, _) = first.expect("the caller passes a file");
-    // Without the flag they may all be grey.
+    // Without `--channel`, pictures with colours are still read if all pixels are grey.
     let of = hints.pick.channel.map(|_| hints.pick.of_pixel(channels, "folder")).transpose()?;
     let channel = of.map(|index| Channel { index, of: channels }).filter(|_| channels > 1);
     let sizes = [shape.width.into(), shape.height.into(), count];
@@ -258,7 +265,7 @@ pub(crate) fn read_files(
         channel,
         notes: notes.clone(),
     };
-    // Deflate is denser than JPEG, of which a byte holds some hundred pixels.
+    // Deflate's limit also covers JPEG, where a byte holds at most some hundred pixels.
     let supply = Supply::deflate("pictures", total);
     let (samples, map) = samples::read(&mut stack, supply, &layout, cap).map_err(|p| {
         // The first picture with colours may have no opacity where others have.
@@ -292,13 +299,13 @@ struct Stack {
     /// Files not yet opened.
     files: VecDeque<PathBuf>,
     shape: Shape,
-    /// Samples of the current rows.
+    /// Decoded samples of the current rows, as bytes.
     rows: Vec<u8>,
-    /// Bytes of them that were handed out.
+    /// Bytes of `rows` that were handed out.
     consumed: usize,
     /// Bytes of the current picture that are still to be decoded.
     left: u64,
-    /// The channel that is read; `None` for the grey.
+    /// Channel that is read; `None` for the grey value.
     channel: Option<Channel>,
     notes: Notes,
 }

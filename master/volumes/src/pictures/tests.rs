@@ -1,6 +1,6 @@
 use slabcast_common::volume::{Samples, Volume};
 
-/// A PNG picture of `width` x `height` pixels from raw rows.
+/// Returns a PNG picture of `width` x `height` pixels from raw rows.
 pub(crate) fn png(
     (width, height): (u32, u32),
     (colour, depth): (::png::ColorType, ::png::BitDepth),
@@ -23,7 +23,7 @@ pub(crate) fn png(
 use ::png::BitDepth::{Eight, Four, One, Sixteen};
 use ::png::ColorType::{Grayscale, GrayscaleAlpha, Indexed, Rgb, Rgba};
 
-/// A baseline JPEG of 16 x 8 pixels: 8 of them 50, the other 200. By the encoder below.
+/// Returns a baseline JPEG of 16 x 8 pixels: one block of 50 and one of 200.
 pub(crate) fn jpeg(colours: bool) -> Vec<u8> {
     let mut out = vec![0xff, 0xd8];
     // A table of quantisation of ones.

@@ -1,9 +1,9 @@
-//! Store of the bricks of one volume that a transfer function can see.
+//! Store of the bricks of one volume with voxels that a transfer function shows.
 //!
-//! A volume is cut block by block ([`crate::blocks::BLOCK_EDGE`]), each from the samples in and around
-//! it. A block whose values a transfer function does not show is not read; one that an earlier store
-//! cut for the same values is shared with it, so that an edit of the function cuts only the blocks it
-//! changes.
+//! A volume is cut block by block ([`crate::blocks::BLOCK_EDGE`]), each from the samples in and
+//! around it. A block whose values the transfer function does not show is not read. A block that an
+//! earlier store cut for the same values is shared with that store, so that an edit of the function
+//! cuts only the blocks it changes.
 //!
 //! A store does not change after it was built, so all senders share it in an [`std::sync::Arc`].
 //! Bricks are encoded as they are cut; remote workers are sent these bytes, and sending to sixty
@@ -31,18 +31,18 @@ use slabcast_scene::brick_needs::BrickNeeds;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// The bricks of a volume that hold a relevant voxel. Each is kept once, encoded or decoded. A voxel
-/// is relevant if the transfer function shows its value and it lies inside the cropping box, or near
-/// such a voxel ([`BrickNeeds::halo`]).
+/// The bricks of a volume that hold a relevant voxel. Each is kept once, encoded or decoded. A
+/// voxel is relevant if the transfer function shows its value and it lies inside the cropping box,
+/// or near such a voxel ([`BrickNeeds::halo`]).
 pub struct BrickStore {
     key: BrickSetKey,
     needs: BrickNeeds,
     grid: BrickGrid,
     /// All bricks in ascending id.
     infos: Arc<[BrickInfo]>,
-    /// Bricks of each block of the volume, i fastest; `None` of a block without any.
+    /// Bricks of each block of the volume, i fastest; `None` for a block without bricks.
     blocks: Vec<Option<Arc<CutBlock>>>,
-    /// Where contents that were dropped come from; `None` if all are kept.
+    /// Source to cut dropped contents from again; `None` if all contents are kept.
     again: Option<Again>,
     relevant_voxels: u64,
     bytes: u64,
@@ -52,7 +52,7 @@ pub struct BrickStore {
 /// The bricks of one block, in ascending id.
 struct CutBlock {
     infos: Vec<BrickInfo>,
-    /// Their contents; `None` if they were dropped to be cut again when they are asked for.
+    /// Contents of the bricks; `None` if they were dropped, to be cut again on request.
     contents: Mutex<Option<Contents>>,
 }
 
@@ -83,7 +83,7 @@ impl CutBlock {
     }
 }
 
-/// Separates infos from encodings.
+/// Splits encoded bricks into their infos and their contents.
 fn split(bricks: Vec<(BrickInfo, Bytes)>) -> (Vec<BrickInfo>, Contents) {
     let content = |(info, bytes)| (info, Mutex::new(Content::Encoded(bytes)));
     let (infos, contents): (_, Vec<_>) = bricks.into_iter().map(content).unzip();
@@ -102,13 +102,13 @@ impl BrickStore {
         BrickStore::from_blocks(info, needs, blocks.expect("samples in memory can be read"), None)
     }
 
-    /// Cuts a level of a volume into bricks on all cores of rayon's pool, like
-    /// [`BrickStore::build`]. Blocks that are the same in `before`, a store of the same level, are
-    /// shared with it. About `keep_bytes` of contents are kept; what goes beyond is dropped, least
-    /// recently asked for first, and cut again when it is asked for.
+    /// Cuts a level of a volume into bricks on all cores of rayon's pool. Bricks without a relevant
+    /// voxel are left out. Blocks that are the same in `before`, a store of the same level, are
+    /// shared with it. About `keep_bytes` of contents are kept; the least recently used ones beyond
+    /// are dropped, and cut again on request.
     ///
     /// # Errors
-    /// A file can't be read, or is damaged; or bricks are to hold coefficients of a level that is not
+    /// A file can't be read or is damaged, or bricks shall hold coefficients of a level that is not
     /// in memory as a whole.
     pub fn cut(
         source: &Arc<dyn BlockSource>,
@@ -149,7 +149,7 @@ impl BrickStore {
         }
     }
 
-    /// Returns the key of this set of bricks: of the volume's digest and the needs.
+    /// Returns the key of this set of bricks, made from the volume's digest and the needs.
     pub fn key(&self) -> BrickSetKey {
         self.key
     }
@@ -194,7 +194,8 @@ impl BrickStore {
         })
     }
 
-    /// Returns [`BrickStore::try_brick`] of a store in memory.
+    /// Returns a decoded brick of a store in memory; `None` if it has no relevant voxel
+    /// ([`BrickStore::try_brick`]).
     ///
     /// # Panics
     /// If the store reads a file that can't be read any more.
@@ -202,7 +203,8 @@ impl BrickStore {
         self.try_brick(id).expect("samples in memory can be read")
     }
 
-    /// Returns [`BrickStore::try_encoded`] of a store in memory.
+    /// Returns the encoding of a brick of a store in memory; `None` if it has no relevant voxel
+    /// ([`BrickStore::try_encoded`]).
     ///
     /// # Panics
     /// If the store reads a file that can't be read any more.
@@ -210,12 +212,12 @@ impl BrickStore {
         self.try_encoded(id).expect("samples in memory can be read")
     }
 
-    /// Returns the bytes of contents that are kept in memory at most.
+    /// Returns the most bytes of contents that are kept in memory.
     pub fn kept_bytes(&self) -> u64 {
         self.again.as_ref().map_or(self.bytes, |again| self.bytes.min(again.keep_bytes))
     }
 
-    /// Returns whether asking for a brick may read a file.
+    /// Returns whether a request for a brick may read a file.
     pub fn may_read(&self) -> bool {
         self.again.as_ref().is_some_and(|again| self.bytes > again.keep_bytes)
     }
@@ -293,11 +295,11 @@ impl BrickStore {
     }
 }
 
-/// Source of the contents that a store dropped, and those it keeps.
+/// Source of dropped contents, and the record of which contents are kept.
 struct Again {
     source: Arc<dyn BlockSource>,
     level: usize,
-    /// Bytes of contents to keep.
+    /// Budget of contents in bytes.
     keep_bytes: u64,
     kept: Mutex<Kept>,
 }
@@ -307,15 +309,15 @@ struct Again {
 struct Kept {
     bytes: u64,
     clock: u64,
-    /// When each block was used last, and its bytes.
+    /// Time of each block's last use, and its bytes.
     used: BTreeMap<usize, (u64, u64)>,
-    /// Blocks by when they were used last.
+    /// Blocks by the time of their last use.
     order: BTreeMap<u64, usize>,
 }
 
 impl Again {
-    /// Notes that a block of `bytes` is used. Returns the blocks to drop. A `new` one is dropped itself
-    /// if there is no room for it.
+    /// Notes that a block of `bytes` is used, and returns the blocks to drop. A `new` block without
+    /// room is among them.
     fn keep(&self, block: usize, bytes: u64, new: bool) -> Vec<usize> {
         let kept = &mut *self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         kept.clock += 1;
@@ -374,7 +376,7 @@ fn cut_blocks(
         }
         Ok(cut)
     };
-    // In order, so that neighbours find what a source decoded for the blocks before.
+    // In order, so that neighbouring blocks find decoded chunks in the source's cache.
     let mut cut = Vec::with_capacity(summaries.all.len());
     for first in (0..summaries.all.len()).step_by(BLOCKS_AT_A_TIME) {
         let together = first..(first + BLOCKS_AT_A_TIME).min(summaries.all.len());
@@ -384,7 +386,7 @@ fn cut_blocks(
     Ok(cut)
 }
 
-/// Size of a brick set, from what is known of blocks without their samples: an upper bound.
+/// Upper bound of the size of a brick set, from the summaries of its blocks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Estimate {
     /// Number of blocks to read.
@@ -395,7 +397,7 @@ pub struct Estimate {
     pub bytes: u64,
 }
 
-/// Returns how large the set with these needs of a level may become.
+/// Estimates the size of the brick set with `needs` of a level, without reading samples.
 ///
 /// # Errors
 /// A file can't be read, or is damaged.
@@ -438,7 +440,7 @@ fn cut_block(
     Cutting::new(source, level, needs)?.block(block)
 }
 
-/// A level being cut: what all its blocks have in common.
+/// Inputs that all blocks of a level share while it is cut.
 struct Cutting<'a> {
     source: &'a dyn BlockSource,
     level: usize,

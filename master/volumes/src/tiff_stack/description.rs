@@ -66,8 +66,8 @@ impl Description {
         }
     }
 
-    /// Returns which pages are slices: those of the picked channel and time, by default the first.
-    /// Notes what was not asked for.
+    /// Returns the pages of the picked channel and time, by default the first, which are the
+    /// slices. Notes the choices without a flag.
     pub(super) fn slices(&mut self, pick: &Pick) -> Result<Option<Slices>, Problem> {
         if self.axes.is_empty() {
             pick.choose(&[], "ImageDescription")?;
@@ -121,7 +121,7 @@ fn refused(what: impl Into<String>) -> Problem {
     )
 }
 
-/// ImageJ writes lines of `key=value`; channels go fastest, times slowest.
+/// Parses ImageJ's description: lines of `key=value`. Channels go fastest, times slowest.
 fn imagej(text: &str) -> Result<Description, Problem> {
     let get = |key: &str| {
         text.lines().find_map(|l| l.strip_prefix(key)?.strip_prefix('=').map(str::trim))
@@ -210,7 +210,7 @@ fn ome(text: &str, pixels: &str) -> Result<Description, Problem> {
     // OME names the fastest axis first.
     description.axes = letters.chars().rev().map(|c| (axis_name(c, 0), size(c))).collect();
     let several = size('C').saturating_mul(size('T')) > 1;
-    // Where the pages of channels and times are told one by one, they must be in that order.
+    // If the file lists the pages of channels and times one by one, they must be in that order.
     for data in elements(text, "TiffData").filter(|_| several) {
         let (mut index, mut step) = (0u64, 1u64);
         for c in letters.chars() {
@@ -240,7 +240,8 @@ fn ome(text: &str, pixels: &str) -> Result<Description, Problem> {
     Ok(description)
 }
 
-/// tifffile writes `{"shape": [2, 6, 10, 12], "axes": "CZYX"}`, the slowest axis first.
+/// Parses tifffile's description: `{"shape": [2, 6, 10, 12], "axes": "CZYX"}`, the slowest axis
+/// first.
 fn shaped(text: &str, page: &Page) -> Result<Description, Problem> {
     let (width, height) = (u64::from(page.width), u64::from(page.height));
     let after = |key: &str| {

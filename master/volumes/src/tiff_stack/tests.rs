@@ -290,7 +290,7 @@ fn tiff_channels_and_times_are_axes_and_the_first_is_read() {
         let (v, notes) = noted(by_hand(text, 6, 6, 1, 1)).unwrap();
         assert_eq!((v.lattice.dims, notes.as_str()), ([4, 3, 6], ""), "{text}");
     }
-    // Where it can't be told, or does not fit, the refusal says so.
+    // If the layout is missing or does not fit, the refusal tells it.
     for (text, say) in [
         ("{\"shape\": [2, 5, 3, 4], \"axes\": \"CZYX\"}", "2 channels or times of 5 slices"),
         ("{\"shape\": [6, 3, 4], \"axes\": \"ZXY\"}", "the axes `ZXY`, whose last are not Y and X"),

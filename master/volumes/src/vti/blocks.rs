@@ -1,5 +1,5 @@
-//! Readers of compressed blocks, each of known compressed and decoded size, and of text up to the
-//! next tag.
+//! Readers of compressed blocks, whose compressed and decoded sizes are known, and of text up to
+//! the next tag.
 
 use crate::error::{OpenErrorKind, Problem};
 use crate::samples::Supply;
@@ -7,18 +7,18 @@ use crate::unpack::{self, wrapped};
 use flate2::read::ZlibDecoder;
 use std::io::{BufRead, Cursor, Read, Take};
 
-/// How blocks are compressed.
+/// Compression of the blocks of an array.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Compressor {
     Zlib,
     /// Bare lz4 blocks, whose decoded sizes the header has.
     Lz4,
-    /// What VTK calls LZMA: each block is a whole xz file.
+    /// VTK's LZMA: each block is a whole xz file.
     Xz,
 }
 
 impl Compressor {
-    /// Returns the supply of `bytes` bytes of blocks.
+    /// Returns the limit on decoded bytes that `bytes` bytes of blocks can become.
     pub(super) fn supply(self, bytes: u64) -> Supply {
         match self {
             Compressor::Zlib => Supply::deflate("zlib", bytes),
@@ -28,7 +28,7 @@ impl Compressor {
     }
 }
 
-/// Most bytes that a byte of lz4 stands for: one more of a match's length each.
+/// Most decoded bytes for one byte of lz4: each byte adds at most 255 to a match's length.
 const LZ4_RATIO: u64 = 255;
 /// Most bytes of an lz4 block, which is decoded whole; VTK's own have 32 KiB.
 const LZ4_MAX_BYTES: u64 = 16 << 20;
@@ -116,7 +116,7 @@ impl Blocks {
             Compressor::Zlib => Block::Zlib(ZlibDecoder::new(body)),
             Compressor::Xz => Block::Xz(Box::new(unpack::xz(body))),
             Compressor::Lz4 => {
-                // A size is believed where the bytes can account for it.
+                // Memory is taken only for a size that this many packed bytes can decode to.
                 let most = LZ4_MAX_BYTES.min(LZ4_RATIO * packed.min(LZ4_MAX_BYTES));
                 if self.left > most || packed > LZ4_MAX_BYTES {
                     return Err(self.damaged("says a size that it can't have"));

@@ -1,9 +1,10 @@
 //! Reader of VTK's XML image data (`.vti`): ascii, base64 and appended, plain or in blocks of zlib,
 //! lz4 or xz.
 //!
-//! With raw appended data the file is no valid XML, so it is read as a stream of tags. One array is
-//! drawn: the one asked for, else the active scalars of the points, else the first array with one number
-//! a point, else with one a cell. Points and cells that VTK's masks hide (`vtkGhostType`, `vtkValidPointMask`) become NaN.
+//! With raw appended data the file is not valid XML, so it is read as a stream of tags. One array
+//! is drawn: the one asked for, else the active scalars of the points, else the first array with
+//! one number a point, else the first with one number a cell. Points and cells that VTK's masks
+//! hide (`vtkGhostType`, `vtkValidPointMask`) become NaN.
 //!
 //! Binary data begin with a header of 32- or 64-bit numbers (`header_type`). Plain data have the
 //! number of bytes; compressed data have the number of blocks, the size of a whole one, the size of
@@ -65,7 +66,8 @@ pub(crate) fn read(source: Source, name: &str, dataset: Option<&str>) -> Result<
         let (format, start) = arrays.start(place, len)?;
         Ok((format, stream.reader(start)?, len - start))
     };
-    // Masks first: none may be kept for writing.
+    // Masks are read before the array, since its numbers can't be kept for writing if one hides
+    // anything.
     let mut hidden: Vec<bool> = Vec::new();
     for (mask, place) in arrays.masks.iter().filter(|(mask, _)| mask.cells == array.cells) {
         let (dims, _) = image.dims_and_origin(mask.cells)?;
@@ -95,7 +97,7 @@ pub(crate) fn read(source: Source, name: &str, dataset: Option<&str>) -> Result<
     let beside = cap.beside.clone();
     let mut volume = finish(file, image, (array, channel), open(place)?, (name, cap))?;
     if hidden.contains(&true) {
-        // The numbers would show what is not there.
+        // The file's numbers are dropped: written, they would show hidden points.
         beside.take_numbers();
         let code = |(i, hidden): (usize, bool)| match hidden {
             true => f32::NAN,
@@ -110,12 +112,13 @@ pub(crate) fn read(source: Source, name: &str, dataset: Option<&str>) -> Result<
     Ok(volume)
 }
 
-/// A stream that several readers take turns with.
+/// A stream that several readers share, one at a time.
 #[derive(Clone)]
 struct SharedStream(Arc<Mutex<Box<dyn Stream>>>);
 
 impl SharedStream {
-    /// Returns a reader from a place of the file on. It ends the use of those before it.
+    /// Returns a reader from byte `start` of the file on. Readers returned earlier must not be used
+    /// any more.
     fn reader(&self, start: u64) -> Result<BufReader<Box<dyn Stream>>, Problem> {
         let mut stream = self.clone();
         stream.seek(SeekFrom::Start(start)).map_err(|e| Problem::io("content", &e))?;
@@ -141,7 +144,7 @@ impl Seek for SharedStream {
     }
 }
 
-/// Where an array's data are.
+/// Place of an array's data.
 enum Place {
     /// After its tag, at this place of the file.
     Inline(DataFormat, u64),
@@ -157,7 +160,7 @@ struct Arrays {
     drawn: (Array, Place),
     /// Names of all arrays with one number a point, or a cell.
     names: Vec<String>,
-    /// Arrays that say which points or cells are not there.
+    /// Arrays that hide points or cells.
     masks: Vec<(Array, Place)>,
     /// Format and place of the appended data.
     appended: Option<(DataFormat, u64)>,
@@ -180,7 +183,7 @@ impl Arrays {
             let tag = match tags.next() {
                 Ok(Some(tag)) => tag,
                 Ok(None) => break,
-                // Where the drawn array is, is known.
+                // A damaged tag does no harm once the drawn array is found.
                 Err(_) if matches!(drawn, Some((_, Place::Inline(..)))) => break,
                 Err(p) => return Err(p),
             };
@@ -293,8 +296,8 @@ impl Arrays {
     }
 }
 
-/// Arrays by which VTK marks points and cells that are not there, or that another piece has. They
-/// are never the volume.
+/// Names of the arrays in which VTK marks hidden points and cells, and those that another piece
+/// has. They are never the volume.
 const MASKS: [&str; 4] =
     ["vtkGhostType", "vtkValidPointMask", "vtkValidCellMask", "vtkGhostLevels"];
 /// Most names kept for the note on other arrays.
@@ -305,7 +308,7 @@ struct File {
     endian: Endian,
     /// Bytes of a number in a data header, 4 or 8.
     header_word_bytes: usize,
-    /// How the blocks of binary data are compressed, if they are.
+    /// Compression of the blocks of binary data; `None` for uncompressed data.
     compressor: Option<Compressor>,
 }
 
@@ -433,7 +436,7 @@ impl Section {
             return (asked == name).then(|| self.array(tag)).transpose();
         }
         match &self.scalars {
-            // Active scalars that are no volume say nothing.
+            // Active scalars that are a mask don't choose an array.
             Some(scalars) if scalars != name && !MASKS.contains(&scalars.as_str()) => {
                 return Ok(None);
             }
@@ -541,7 +544,7 @@ fn finish(
     Ok(crate::stream::volume(name, array.number.name(), false, lattice, samples, map))
 }
 
-/// Reads an array, or the part of it that is one of its components.
+/// Reads an array, or with `part` one of its components.
 fn read_array(
     file: &File,
     (layout, part): (&Layout, Option<&Part>),

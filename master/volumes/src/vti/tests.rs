@@ -22,7 +22,7 @@ pub(crate) const WAYS: [Way; 7] = [
     Way::Appended { packed: true, base64: true },
 ];
 
-/// A block as VTK's compressor of this name writes it.
+/// Compresses a block as VTK's compressor of this name does.
 fn block(compressor: &str, data: &[u8]) -> Vec<u8> {
     match compressor {
         "LZ4" => lz4_flex::block::compress(data),
@@ -31,7 +31,8 @@ fn block(compressor: &str, data: &[u8]) -> Vec<u8> {
     }
 }
 
-/// An array with its header, `word` bytes a number, in blocks of 16 bytes if it has a compressor.
+/// Returns an array with its header of `word` bytes a number, in blocks of 16 bytes if it has a
+/// compressor.
 fn binary(data: &[u8], compressor: Option<&str>, base: bool, word: usize, big: bool) -> Vec<u8> {
     let number = |n: usize| match big {
         true => (n as u64).to_be_bytes()[8 - word..].to_vec(),
@@ -56,19 +57,21 @@ fn binary(data: &[u8], compressor: Option<&str>, base: bool, word: usize, big: b
     }
 }
 
-/// A file of bytes `data` as 5 x 3 x 2 samples of `kind`, with another array before it.
+/// Returns a file of bytes `data` as 5 x 3 x 2 samples of `kind`, with another array before it.
+/// Packed arrays are compressed by zlib.
 pub(crate) fn vti(way: Way, kind: &str, data: &[u8], word: usize, big: bool) -> Vec<u8> {
     vti_by("ZLib", way, kind, data, word, big)
 }
 
-/// Files of `data` in blocks of lz4 and xz.
+/// Returns files of `data` in blocks of lz4 and xz.
 pub(crate) fn packed(data: &[u8]) -> Vec<Vec<u8>> {
     let ways = [WAYS[2], WAYS[4], WAYS[6]];
     let files = |name| ways.map(|way| vti_by(name, way, "UInt8", data, 4, false));
     ["LZ4", "LZMA"].into_iter().flat_map(files).collect()
 }
 
-/// Like [`vti`]; a packed array by VTK's compressor of this name.
+/// Returns a file of bytes `data` as 5 x 3 x 2 samples of `kind`, with another array before it.
+/// Packed arrays are compressed by VTK's compressor `name`.
 fn vti_by(name: &str, way: Way, kind: &str, data: &[u8], word: usize, big: bool) -> Vec<u8> {
     let order = if big { "BigEndian" } else { "LittleEndian" };
     let packed = matches!(way, Way::Inline { packed: true } | Way::Appended { packed: true, .. });
@@ -152,7 +155,7 @@ fn vti_blocks_of_lz4_and_xz_are_read_and_damage_is_named() {
         let e = open(file[..at].to_vec()).unwrap_err().to_string();
         assert!(e.contains("of 8: ") && e.contains("; get the file again"), "{name}: {e}");
     }
-    // A block that says more than it can hold takes no memory.
+    // A block that claims more than it can hold takes no memory.
     let file = vti_by("LZ4", WAYS[4], "UInt8", &data, 4, false);
     let at = file.windows(12).position(|w| w == [2, 0, 0, 0, 16, 0, 0, 0, 14, 0, 0, 0]).unwrap();
     let large = String::from_utf8_lossy(&file[..at]).replace("1 5 0 2 0 1", "1 1024 1 1024 1 1024");

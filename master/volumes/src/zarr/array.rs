@@ -40,9 +40,9 @@ pub(super) fn is_array(root: &Folder, folder: &str) -> bool {
 
 /// An array's metadata.
 pub(crate) struct Array {
-    /// The opened folder, which no chunk's file is outside of.
+    /// The opened folder. All chunk files lie in it.
     pub(super) root: Arc<Folder>,
-    /// The array's path in it.
+    /// Path of the array in the opened folder.
     pub(super) folder: String,
     pub(super) shape: Vec<u64>,
     /// Names of the axes, if the array gives one for each; an axis without a name has an empty one.
@@ -51,7 +51,7 @@ pub(crate) struct Array {
     pub(super) grid: Vec<u64>,
     /// Type of the samples in memory.
     pub(crate) number: Number,
-    /// Name of their type in the file.
+    /// Name of the samples' type in the file.
     pub(super) kind: &'static str,
     pub(super) endian: Endian,
     /// Sample in place of missing chunks, little-endian.
@@ -61,7 +61,7 @@ pub(crate) struct Array {
     pub(super) shard: Option<Shard>,
 }
 
-/// Where a shard lies: its bytes in the file, the index of its first sample, and its shape.
+/// Place of a shard: its bytes in the file, the index of its first sample, and its shape.
 struct ShardPlace<'a> {
     at: u64,
     len: u64,
@@ -69,7 +69,7 @@ struct ShardPlace<'a> {
     grid: &'a [u64],
 }
 
-/// How chunk files are named.
+/// Rule for the names of chunk files.
 pub(super) struct ChunkKey {
     /// First part of the path: `c` in version 3, empty in version 2.
     prefix: &'static str,
@@ -119,12 +119,13 @@ impl Array {
         }
     }
 
-    /// Returns the bytes of a sample in a decoded chunk.
+    /// Returns the size of a sample in a decoded chunk, in bytes.
     fn stored_size(&self) -> u64 {
         if self.kind == HALF { 2 } else { self.number.bytes() }
     }
 
-    /// Returns the shape that is decoded at a time: a chunk, or an inner chunk of a shard.
+    /// Returns the shape of the smallest unit that can be decoded: a chunk, or an inner chunk of a
+    /// shard.
     pub(super) fn inner(&self) -> &[u64] {
         self.shard.as_ref().map_or(&self.grid, |s| s.innermost())
     }
@@ -206,7 +207,7 @@ impl Array {
         })
     }
 
-    /// Checks the numbers of files and of inner chunks that reading has to look at.
+    /// Checks that reading needs at most [`FILES_MAX`] files and [`INNER_MAX`] inner chunks.
     pub(crate) fn check_counts(&self, placed: &Placed) -> Result<(), Problem> {
         let along = |step: &[u64]| {
             placed.axes.iter().flatten().map(|&a| self.shape[a].div_ceil(step[a])).product::<u64>()
@@ -241,8 +242,8 @@ impl Array {
         placed.at.iter().zip(&self.grid).map(|(at, grid)| at / grid).collect()
     }
 
-    /// Returns the bytes of the chunk files, or 0 where the limit does not depend on them. Counts
-    /// only until the limit is met.
+    /// Returns the size of the chunk files in bytes, or 0 if the limit of samples does not depend
+    /// on it. Stops counting once the limit is reached.
     pub(super) fn stored_bytes(&self, cap: &ByteCap, placed: &Placed) -> u64 {
         let enough = cap.stored_for(placed.bytes(self));
         let mut stored = 0;
@@ -268,7 +269,8 @@ impl Array {
         stored
     }
 
-    /// Reads the samples along the axes of `placed`. What codes do not hold is left `beside`.
+    /// Reads the samples along the axes of `placed`; returns codes and their map to numbers.
+    /// Numbers that codes round are kept in `beside`.
     pub(super) fn read(
         &self,
         placed: &Placed,
@@ -293,7 +295,8 @@ impl Array {
                 wide::without_fillers(self.collect(placed, code)?, beside)?
             }
             Number::F32 => wide::without_fillers(self.collect(placed, le!(f32))?, beside)?,
-            // Their range decides the codes, so all are kept in their type first.
+            // The range of all samples decides the codes, so they are first collected in their own
+            // type.
             Number::U32 => wide::compact_integers(self.collect_pieces(placed, le!(u32))?, beside)?,
             Number::I32 => wide::compact_integers(self.collect_pieces(placed, le!(i32))?, beside)?,
             Number::U64 => wide::compact_integers(self.collect_pieces(placed, le!(u64))?, beside)?,
@@ -335,7 +338,7 @@ impl Array {
         let [nx, ny, nz] = placed.dims.map(|n| n as usize);
         let depth = self.depth(placed);
         let samples = nx * ny * (nz.min(layers.end * depth) - layers.start * depth);
-        // Zeros that the system gives, so that pages are first touched by the threads that fill them.
+        // Zeros from the system, so that the threads which fill pages also touch them first.
         reserve(&mut Vec::<T>::new(), samples)?;
         let mut out = vec![T::default(); samples];
         let layer = |(z, out): (usize, &mut [T])| self.layer(placed, layers.start + z, out, code);
@@ -444,12 +447,13 @@ impl Array {
         Ok(decoded)
     }
 
-    /// Returns the bytes of a decoded chunk.
+    /// Returns the size of a decoded chunk in bytes.
     fn chunk_bytes(&self) -> usize {
         (self.inner().iter().product::<u64>() * self.stored_size()) as usize
     }
 
-    /// Decodes the chunks of a shard that lie in `layer` into `out`. A shard's chunks may be shards.
+    /// Decodes the chunks of a shard that lie in `layer` into `out`. A shard's chunks may be
+    /// shards.
     fn read_shard<T: Copy, const N: usize>(
         &self,
         placed: &Placed,
@@ -507,8 +511,8 @@ impl Array {
         Ok(())
     }
 
-    /// Puts the fill value in place of a chunk of `shape`, whose first sample has index `first` in the
-    /// array, where it lies in `layer`.
+    /// Puts the fill value in place of a chunk of `shape`, whose first sample has index `first` in
+    /// the array, where it lies in `layer`.
     fn fill<T: Copy, const N: usize>(
         &self,
         placed: &Placed,
@@ -620,7 +624,7 @@ fn number(name: &str) -> Option<(Number, &'static str)> {
     }
 }
 
-/// Returns a fill value as the array stores it: of float16 in two bytes.
+/// Returns the fill value in the array's stored type: float16 takes two bytes.
 fn stored_fill(bytes: [u8; 8], kind: &str) -> [u8; 8] {
     if kind != HALF {
         return bytes;

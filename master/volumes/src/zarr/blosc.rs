@@ -95,7 +95,7 @@ fn unpack(kind: u8, from: &[u8], to: &mut [u8]) -> Result<(), Problem> {
     }
 }
 
-/// Bytes of a block that is packed at a time: fits the second-level cache.
+/// Size of a block that is packed, in bytes; it fits the second-level cache.
 const BLOCK_BYTES: usize = 256 << 10;
 
 /// Packs numbers of `size` bytes with lz4, their bytes shuffled, as c-blosc reads them.
@@ -124,7 +124,7 @@ pub(crate) fn encode(numbers: &[u8], size: usize) -> Vec<u8> {
         let packed = lz4_flex::block::compress_into(part, &mut out[at + 4..]);
         let len = match packed {
             Ok(len) if len < part.len() => len,
-            // As it is.
+            // A part that lz4 does not shrink is stored uncompressed.
             _ => {
                 out[at + 4..at + 4 + part.len()].copy_from_slice(part);
                 part.len()
@@ -147,7 +147,7 @@ pub(crate) fn encode(numbers: &[u8], size: usize) -> Vec<u8> {
     out
 }
 
-/// Sorts bytes: first those that are first in their number, then the second ones, and so on.
+/// Shuffles bytes: the first byte of each number, then the second byte of each, and so on.
 fn shuffle(numbers: &[u8], size: usize, out: &mut Vec<u8>) {
     fn of<const SIZE: usize>(numbers: &[u8], out: &mut [u8]) {
         for (byte, to) in out.chunks_exact_mut(numbers.len() / SIZE).enumerate() {
@@ -164,8 +164,8 @@ fn shuffle(numbers: &[u8], size: usize, out: &mut Vec<u8>) {
     }
 }
 
-/// Undoes the byte shuffle: first bytes of all numbers, then second bytes, and so on. Bytes left
-/// over are not shuffled.
+/// Undoes the byte shuffle of numbers of `size` bytes. Bytes beyond the last whole number are not
+/// shuffled.
 fn unshuffle(plain: &[u8], size: usize, out: &mut Vec<u8>) {
     let n = plain.len() / size;
     let (start, whole) = (out.len(), n * size);
@@ -195,8 +195,8 @@ fn unshuffle_of<const SIZE: usize>(plain: &[u8], to: &mut [u8]) {
     }
 }
 
-/// Undoes the bit shuffle of a block. c-blosc 1 leaves a block as it is whose numbers are no
-/// multiple of eight (c-blosc issue 240). Bytes beyond the last number are not shuffled.
+/// Undoes the bit shuffle of a block. c-blosc 1 does not shuffle a block whose count of numbers is
+/// not a multiple of eight (c-blosc issue 240). Bytes beyond the last number are not shuffled.
 fn unshuffle_bits(plain: &[u8], size: usize, out: &mut Vec<u8>) {
     let n = plain.len() / size;
     if !n.is_multiple_of(8) {

@@ -1,8 +1,8 @@
 //! Reads chunks of an array one by one, at any time after it was opened.
 //!
-//! The files of an array are listed when it is opened ([`Listing`]). Each is checked against the list
-//! when its turn comes, so that a file which is gone, was cut off or replaced is an error of that file
-//! and not zeros.
+//! The files of an array are listed when it is opened ([`Listing`]). Each file is checked against
+//! the list before it is read. So a file that was removed, cut off or replaced is an error; it is
+//! not taken for a chunk that was never written.
 
 use super::array::Array;
 use super::json;
@@ -20,7 +20,7 @@ use std::time::SystemTime;
 const FILES_MAX: usize = 1 << 20;
 /// Most folders below one another.
 const DEPTH_MAX: u32 = 20;
-/// Most files that are open at a time, with their indices: a shard's has 8 KiB.
+/// Most files that are open at once. Each holds the index of its shard, 8 KiB.
 const OPEN_MAX: usize = 128;
 
 /// Length and time of change of a file.
@@ -35,7 +35,7 @@ impl Stamp {
         Stamp { len: meta.len(), changed: meta.modified().ok() }
     }
 
-    /// Returns the stamp of what a path names.
+    /// Returns the stamp of the file at a path.
     pub(crate) fn of_path(path: &Path) -> std::io::Result<Stamp> {
         std::fs::metadata(path).map(|meta| Stamp::of(&meta))
     }
@@ -46,10 +46,10 @@ impl Stamp {
 pub(crate) struct Listing(BTreeMap<String, Stamp>);
 
 impl Listing {
-    /// Lists all files below a folder but hidden ones.
+    /// Lists all files below a folder, except hidden ones.
     ///
     /// # Errors
-    /// A folder that can't be read, or has too many files.
+    /// A folder can't be read, or there are too many files.
     pub(crate) fn read(folder: &Path) -> Result<Listing, Problem> {
         let mut listing = Listing::default();
         listing.add(folder, "", 0)?;
@@ -105,7 +105,7 @@ struct ChunkFile {
     index: Option<Vec<(u64, u64)>>,
 }
 
-/// Reads the chunks of one level.
+/// Reader of the chunks of one level.
 pub(crate) struct LevelReader {
     array: Array,
     placed: Placed,
@@ -114,7 +114,7 @@ pub(crate) struct LevelReader {
 }
 
 impl LevelReader {
-    /// Returns a reader of an array, whose files are in a list.
+    /// Returns a reader of an array whose files are in `listing`.
     pub(crate) fn new(array: Array, placed: Placed, listing: Arc<Listing>) -> LevelReader {
         LevelReader { array, placed, listing, open: Mutex::default() }
     }
@@ -127,7 +127,7 @@ impl LevelReader {
         &self.placed
     }
 
-    /// Returns the samples of a chunk along x, y and z; at most those of the level.
+    /// Returns the shape of a chunk along x, y and z, in samples; at most the level's.
     pub(crate) fn chunk_shape(&self) -> [u32; 3] {
         let inner = self.array.inner();
         std::array::from_fn(|axis| {
@@ -136,16 +136,17 @@ impl LevelReader {
         })
     }
 
-    /// Returns the number that is in place of missing chunks, as little-endian bytes.
+    /// Returns the fill value, which stands for missing chunks, as little-endian bytes.
     pub(crate) fn fill(&self) -> &[u8] {
         &self.array.fill[..self.array.number.bytes() as usize]
     }
 
-    /// Returns the numbers of the chunk at a position, counted in chunks, as far as it lies in the
-    /// level: x fastest, little-endian. `None` for a chunk that was never written.
+    /// Returns the numbers of the chunk at position `at`, counted in chunks: x fastest,
+    /// little-endian, without the part beyond the level's end. `None` for a chunk that was never
+    /// written.
     ///
     /// # Errors
-    /// The file is gone, was replaced, is cut off or damaged.
+    /// The file was removed or replaced, is cut off or damaged.
     pub(crate) fn chunk(&self, at: [u32; 3]) -> Result<Option<Vec<u8>>, Problem> {
         let (array, placed) = (&self.array, &self.placed);
         let inner = array.inner();
@@ -244,8 +245,8 @@ impl LevelReader {
         Ok(file)
     }
 
-    /// Returns the numbers of a decoded chunk, whose first index in the array is `first`, x fastest and
-    /// as far as they lie in the level.
+    /// Reorders the numbers of a decoded chunk to x fastest, and drops those beyond the level's
+    /// end. `first` is the chunk's first index along each axis of the array.
     fn ordered(&self, first: &[u64], mut decoded: Vec<u8>) -> Vec<u8> {
         let (array, placed) = (&self.array, &self.placed);
         let size = array.number.bytes() as usize;
@@ -332,7 +333,7 @@ pub(crate) fn fill_at(file: &File, offset: u64, bytes: &mut [u8]) -> Result<(), 
     })
 }
 
-/// Returns the path of a file of a folder.
+/// Joins a folder and a path with `/` separators.
 pub(crate) fn below(folder: &Path, path: &str) -> PathBuf {
     path.split('/').fold(folder.to_path_buf(), |at, part| at.join(part))
 }

@@ -1,4 +1,4 @@
-//! Codecs of chunks in both versions, and the index of a shard.
+//! Codecs of chunks in Zarr versions 2 and 3, and the index of a shard.
 
 use super::blosc;
 use super::json::Json;
@@ -22,11 +22,11 @@ enum Codec {
     /// A checksum of four bytes at the end.
     Crc32c,
     Bzip2,
-    /// What Python calls LZMA, in its usual format.
+    /// Python's LZMA in its default format, xz.
     Xz,
     /// Differences of neighbours, in the order of storage.
     Delta(Number, Endian),
-    /// All first bytes of elements of this size, then all second ones, and so on.
+    /// Byte shuffle of elements of this size: all first bytes, then all second ones, and so on.
     Shuffle(u64),
 }
 
@@ -54,7 +54,8 @@ pub(super) struct Shard {
 }
 
 impl Codecs {
-    /// Parses the codecs of version 3. With a shard, returns those of its inner chunks.
+    /// Parses the codecs of version 3. If they are a shard, returns the codecs of its inner chunks,
+    /// and its layout.
     pub(super) fn version_3(list: &Json, grid: &[u64]) -> Result<(Codecs, Option<Shard>), Problem> {
         let (mut codecs, mut shard) =
             (Codecs { endian: Endian::Little, list: Vec::new(), order: None }, None);
@@ -152,7 +153,7 @@ impl Codecs {
         strides
     }
 
-    /// Decodes a chunk of `len` bytes, which must become `bytes` bytes.
+    /// Reads a chunk of `len` bytes and decodes it; it must become `bytes` bytes.
     pub(super) fn decode(
         &self,
         from: &mut dyn Read,
@@ -165,8 +166,8 @@ impl Codecs {
         self.decode_bytes(data, bytes)
     }
 
-    /// Checks the length of an encoded chunk, before it is read, against that of its samples. No
-    /// encoding makes data much larger.
+    /// Checks the length of an encoded chunk against the length of its samples, before it is read:
+    /// no encoding makes data much larger.
     pub(super) fn check_len(len: u64, bytes: usize) -> Result<(), Problem> {
         match len > 2 * bytes as u64 + 4096 {
             true => Err(damaged(format!("has {len} bytes for {bytes} of samples"))),
@@ -237,7 +238,7 @@ impl Codec {
         })
     }
 
-    /// Returns whether a chunk is as long before as after, but for checksums.
+    /// Returns whether the codec keeps the length of a chunk, except for a checksum.
     fn keeps_size(self) -> bool {
         matches!(self, Codec::Crc32c | Codec::Delta(..) | Codec::Shuffle(_))
     }
@@ -292,8 +293,8 @@ impl Codec {
     }
 }
 
-/// Turns differences into numbers, each the sum of all up to it. Returns whether the data are whole
-/// numbers.
+/// Replaces each difference by the sum of all up to it. Returns false if the data end within a
+/// number.
 fn sum_up(data: &mut [u8], number: Number, endian: Endian) -> bool {
     macro_rules! sum {
         ($t:ty, $add:expr) => {{
@@ -393,7 +394,7 @@ fn permutation(order: &Json, rank: usize) -> Result<Vec<usize>, Problem> {
 }
 
 impl Shard {
-    /// Returns the shape of the chunks in which samples are.
+    /// Returns the shape of the innermost chunks, which hold samples.
     pub(super) fn innermost(&self) -> &[u64] {
         self.nested.as_ref().map_or(&self.inner, |shard| shard.innermost())
     }
@@ -427,8 +428,8 @@ impl Shard {
         Ok(Shard { inner, nested, at_end, checked })
     }
 
-    /// Reads the index of a shard of `len` bytes from `at` on: offset from there and size, in bytes, of
-    /// each inner chunk.
+    /// Reads the index of a shard of `len` bytes from `at` on: offset from there and size, in
+    /// bytes, of each inner chunk.
     pub(super) fn index(
         &self,
         file: &mut File,

@@ -17,7 +17,7 @@ pub(super) struct Json {
 }
 
 impl Json {
-    /// Reads a file of a folder of the opened one, each called by its path.
+    /// Reads the file `name` in `folder`, a path within the opened folder `root`.
     pub(super) fn read(root: &Folder, folder: &str, name: &str) -> Result<Json, Problem> {
         let source = root.named(&path(folder, name), name)?;
         let name = name.to_string();
@@ -93,7 +93,7 @@ impl Json {
     }
 }
 
-/// Returns the path of what is called `name` in `folder`, both from the opened folder.
+/// Joins `folder`, a path within the opened folder, and a name in it.
 pub(super) fn path(folder: &str, name: &str) -> String {
     if folder.is_empty() { name.into() } else { format!("{folder}/{name}") }
 }

@@ -1,8 +1,8 @@
 //! Reader of Zarr arrays (versions 2 and 3, with shards) and OME-Zarr pyramids, from a folder.
 //!
-//! Chunks are decoded straight to their place in the volume. Of a shard the index is read first,
-//! then one inner chunk after another. Of a pyramid the finest level is read that fits the memory
-//! limit.
+//! Chunks are decoded straight to their place in the volume. A shard's index is read first, then
+//! one inner chunk after another. From a pyramid, the finest level that fits the memory limit is
+//! read.
 //!
 //! A volume needs little of the format (regular grids, five codecs), and the `zarrs` crate adds 75
 //! crates to build, one of them with an advisory (`lru`); hence a reader of our own. `ruzstd` and
@@ -45,9 +45,9 @@ pub(crate) struct Picture {
     group: &'static str,
     /// Metadata of the pyramid; `None` for an array.
     pyramid: Option<(Json, Axes)>,
-    /// What our own files say beside the format's metadata.
+    /// The attribute of files that slabcast wrote.
     own: Option<Own>,
-    /// Choices that were made, for people.
+    /// Choices that the reader made, one sentence each.
     pub(crate) notes: Vec<String>,
 }
 
@@ -115,7 +115,7 @@ impl Picture {
         Ok((array, placed))
     }
 
-    /// Returns what our own files say.
+    /// Returns the attribute of files that slabcast wrote.
     pub(crate) fn own(&self) -> Option<&Own> {
         self.own.as_ref()
     }
@@ -181,7 +181,7 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
             count - 1
         ));
     }
-    // Opacities are of the finest level, whatever is drawn.
+    // Opacities are per vox of the finest level, whichever level is drawn.
     let vox = |placed: &Placed| placed.lattice.vox();
     let finest_vox = match level {
         0 => vox(&placed),
@@ -245,9 +245,9 @@ fn multiscales(root: &Folder, group: &str) -> Result<Option<Json>, Problem> {
 pub(crate) struct Placed {
     /// Samples along x, y and z.
     pub(crate) dims: [u64; 3],
-    /// Index of the array's axis for each; `None` where there is one sample.
+    /// Index of the array's axis for x, y and z; `None` for an axis that the array lacks.
     pub(crate) axes: [Option<usize>; 3],
-    /// Index along each axis of the array that is none of these; 0 along these.
+    /// Index along each axis of the array; 0 along x, y and z.
     pub(crate) at: Vec<u64>,
     pub(crate) lattice: Lattice,
     pub(crate) notes: Vec<String>,
@@ -297,7 +297,7 @@ impl Placed {
         let mut at = vec![0; array.shape.len()];
         others.into_iter().zip(picked).for_each(|(a, index)| at[a] = index);
         let dims = axes.map(|a| a.map_or(1, |a| array.shape[a]));
-        // Before anything is counted in bytes.
+        // Checked before sizes are multiplied to bytes.
         let layout = crate::samples::Layout::new(dims, array.number, array.endian, "shape")?;
         let lattice = Lattice {
             origin: glam::DVec3::from_array(origin),
@@ -318,15 +318,15 @@ impl Placed {
     }
 }
 
-/// Returns the axes that are called x, y and z; `None` without an x and a y.
+/// Returns the indices of the axes named x, y and z; `None` without an x and a y.
 fn space(names: &[String]) -> Option<[Option<usize>; 3]> {
     let called = |name: &str| names.iter().position(|n| n.eq_ignore_ascii_case(name));
     let axes = ["x", "y", "z"].map(called);
     (axes[0].is_some() && axes[1].is_some()).then_some(axes)
 }
 
-/// Returns the axes that are x, y and z of an array in which they are not called so: the last three
-/// that are not a channel or a time by name.
+/// Returns the indices of the axes x, y and z in an array without these names: its last three axes
+/// that are not named as channel or time.
 fn unnamed_space(array: &Array, names: &[String]) -> [Option<usize>; 3] {
     const OTHER: [&str; 10] =
         ["c", "ch", "channel", "channels", "t", "time", "times", "band", "sample", "component"];

@@ -1,8 +1,8 @@
-//! What our own OME-Zarr files say beside the format's metadata, in the attribute `slabcast`.
+//! Attribute `slabcast` of the OME-Zarr files that slabcast writes: facts that OME-Zarr can't hold.
 //!
-//! OME-Zarr knows a scale and a translation along each axis, but neither directions nor slope and
-//! intercept. The attribute has them, so that a volume comes back as it was; other programs pass over
-//! it.
+//! OME-Zarr has a scale and a translation along each axis, but neither directions nor slope and
+//! intercept. The attribute has them, so that a converted volume is read back unchanged. Other
+//! programs ignore it.
 
 use super::json::{Json, path};
 use crate::error::Problem;
@@ -77,7 +77,7 @@ impl Own {
         }))
     }
 
-    /// Returns the attribute's value.
+    /// Returns the attribute's value as JSON.
     pub(crate) fn to_json(&self) -> Value {
         let mut own = json!({
             "version": VERSION,
@@ -93,13 +93,13 @@ impl Own {
     }
 
     /// Returns the lattice of a level with the directions of the attribute. `placed` is the level's
-    /// lattice by the format's metadata.
+    /// lattice from the format's metadata.
     ///
     /// # Errors
-    /// The two contradict each other.
+    /// The spacings of attribute and metadata differ.
     pub(super) fn lattice(&self, level: usize, placed: Lattice) -> Result<Lattice, Problem> {
-        // Level 0 has at most twice as many samples as level 1, and so on: any size that halves to
-        // the one that is there will do, since directions and origin do not depend on it.
+        // Level 0's number of samples is not needed: steps and origin of a level do not depend on
+        // it.
         let mut lattice = Lattice { dims: placed.dims, steps: self.steps, origin: self.origin };
         let wanted = placed.spacing();
         for _ in 0..level {

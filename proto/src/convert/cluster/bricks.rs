@@ -135,8 +135,8 @@ impl<I: Iterator<Item = Bytes>> Iterator for BrickBatches<I> {
     type Item = wire::BricksResponse;
 
     fn next(&mut self) -> Option<wire::BricksResponse> {
-        // Of the batch: one tag and three bytes of length in `BricksResponse`, 2 + 32 of the set.
-        // Of a brick: a tag and at most two bytes of length (a brick has at most 3595 bytes).
+        // A batch adds a tag and three bytes of length in `BricksResponse`, and 2 + 32 bytes of the
+        // set. A brick adds a tag and at most two bytes of length (a brick has at most 3595 bytes).
         const OF_BATCH: usize = 4 + 34;
         const OF_BRICK: usize = 3;
         let first = self.next.take().or_else(|| self.bricks.next())?;

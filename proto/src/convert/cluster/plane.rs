@@ -1,13 +1,13 @@
 //! Planes of a tile, exact to the bit and without what is blank.
 //!
-//! How should a tile's opacity, colour and sums cross? Uncompressed they take 32 bytes a pixel, 2
-//! MiB a full tile. A general compressor would find the blank pixels too, at some 20 us for 16 KiB
-//! (docs/design/transport.md section 6). Here the data is known: a pixel that no voxel touched is
-//! zero in all its words, and in many tiles that is most of them. One bit a pixel says so, at the
-//! cost of a copy: a 64x64 result takes 35 us to write and 10 us to read when every pixel is there
-//! (131 KB), 20 and 15 us with 3 in 8 (51 KB), 7 and 2 us when blank (15 bytes); release build, 2
-//! vCPU EPYC, a loop over `from_worker_to_wire` and `from_worker_from_wire`. "Zero" is of bits:
-//! -0.0 is a value like any other and crosses as such.
+//! In which form should a tile's opacity, colour and sums cross? Uncompressed they take 32 bytes a
+//! pixel, 2 MiB a full tile. A general compressor would find the blank pixels too, at some 20 us
+//! for 16 KiB (docs/design/transport.md section 6). Here the data is known: a pixel that no voxel
+//! touched is zero in all its words, and in many tiles that is most of them. One bit a pixel says
+//! so, at the cost of a copy: a 64x64 result takes 35 us to write and 10 us to read when every
+//! pixel is there (131 KB), 20 and 15 us with 3 in 8 (51 KB), 7 and 2 us when blank (15 bytes);
+//! release build, 2 vCPU EPYC, a loop over `from_worker_to_wire` and `from_worker_from_wire`.
+//! "Zero" is of bits: -0.0 is a value like any other and crosses as such.
 
 use super::wire;
 use crate::convert::WireError;

@@ -24,8 +24,8 @@ enum_conversions!(wanted_format_to_wire, wanted_format_from_wire, PixelFormat, w
 
 /// Writes a request for a path.
 ///
-/// Of a path with several kinds of cameras, or a key with several viewpoints, one is written:
-/// `ViewPath::check` refuses such a path, and a client MUST have called it.
+/// A client MUST have called `ViewPath::check`. It refuses a path with several kinds of cameras and
+/// a key with several viewpoints; this function would write only one of them.
 pub fn submit_to_wire(request: &PathRequest) -> wire::SubmitPathRequest {
     wire::SubmitPathRequest {
         client_key: request.client_key.clone(),

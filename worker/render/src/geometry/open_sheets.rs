@@ -95,9 +95,9 @@ impl<V: Copy> Bucket<V> {
 
 /// Voxels of a part that wait for the sheets at which they begin.
 ///
-/// A brick reaches over some twenty sheets, a slab has a thousand and more. So buckets of sheets that
-/// are done pass their memory on to those in front: a bucket of each sheet would keep as much as its
-/// fullest part needed, 60 to 130 MiB a thread in a CT's soft tissue.
+/// A brick reaches over some twenty sheets, a slab has a thousand and more. So buckets of sheets
+/// that are done pass their memory on to those in front: a bucket of each sheet would keep as much
+/// as its fullest part needed, 60 to 130 MiB a thread in a CT's soft tissue.
 pub struct Queues<V> {
     /// Waiting voxels by their first sheet, counted from the slab's first.
     pub buckets: Vec<Bucket<V>>,
@@ -105,8 +105,8 @@ pub struct Queues<V> {
     pub(crate) carried: Vec<(V, i32)>,
     /// All buckets before this one that are not done have memory.
     bare: usize,
-    /// Voxels of the fullest bucket so far. All memory holds as many in the end, whichever bucket has
-    /// it, so that drawing the same again allocates nothing.
+    /// Voxels of the fullest bucket so far. All memory holds as many in the end, whichever bucket
+    /// has it, so that drawing the same again allocates nothing.
     fullest: usize,
 }
 
@@ -117,8 +117,8 @@ impl<V> Default for Queues<V> {
 }
 
 impl<V: Copy> Queues<V> {
-    /// Empties bucket `at`, whose sheet is done, and passes its memory on to the next bucket that has
-    /// none.
+    /// Empties bucket `at`, whose sheet is done, and passes its memory on to the next bucket that
+    /// has none.
     #[inline(always)]
     fn pass_on(&mut self, at: usize) {
         let bucket = &mut self.buckets[at];
@@ -137,8 +137,8 @@ impl<V: Copy> Queues<V> {
         self.buckets[to].items = items;
     }
 
-    /// Empties all buckets and moves their memory to the first ones. Returns how many voxels were in
-    /// them.
+    /// Empties all buckets and moves their memory to the first ones. Returns how many voxels were
+    /// in them.
     fn end(&mut self) -> u64 {
         let (mut voxels, mut filled) = (0, 0);
         for at in 0..self.buckets.len() {
@@ -337,7 +337,8 @@ impl Sifting {
         due
     }
 
-    /// Of `n` pixels `none` had nothing.
+    /// Notes that `none` of `n` pixels had nothing to composite; sifting rests if that is too few
+    /// to pay.
     #[inline(always)]
     fn found(&mut self, none: usize, n: usize) {
         if none * Sifting::PAYS < n {
@@ -381,7 +382,7 @@ impl<S: Recorded> Closes<S> {
         for i in (0..places.len()).step_by(LANES) {
             let places = places.from(i);
             take::<S, N>(simd, (&mut *records, &mut *before), &pixels.all, places, slot, &mut row);
-            // Where rays are parallel, the row's secants stay 1.
+            // With parallel rays, the row's secants stay 1.
             if let Projection::Persp { .. } = part.frame.view.projection {
                 for (lane, &at) in places.at().iter().enumerate() {
                     row.secant[lane] = pixels.secants[at as usize];
@@ -410,7 +411,7 @@ impl<S: Recorded> Closes<S> {
     fn begin_sheet(&mut self, closing: &Rows, touched: &Rows) {
         let Closes { before, was, .. } = self;
         for (y, (closing, was)) in closing.iter().zip(&*was).enumerate() {
-            // Where this sheet has something and the one before had nothing.
+            // Pixels at which this sheet has something and the one before had nothing.
             let mut fresh = closing & !was;
             while fresh != 0 {
                 let x = fresh.trailing_zeros();

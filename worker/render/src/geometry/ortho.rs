@@ -44,7 +44,7 @@ pub const BATCH: usize = 128;
 /// Voxels on their way from a bucket to the records.
 pub struct Batch {
     pub(crate) voxels: [Splat; BATCH],
-    /// Of those that began before the slab, how many of their sheets lie there.
+    /// Number of a voxel's sheets that lie before the slab, if it begins before it.
     pub(crate) gone: [u32; BATCH],
     samples: [u32; BATCH],
     normals: [u16; BATCH],

@@ -245,7 +245,7 @@ impl LayerStack {
         let near: Vec<Range<i32>> =
             (0..2).map(|a| self.profile.near(at[a], &self.across[a])).collect();
         let voxels = (near[0].len() * near[1].len()) as f64;
-        // Of one voxel at each place, the largest that a rounded position moves.
+        // The largest change by a rounded position, from one voxel at each place.
         let steep = |a: usize| -> f64 {
             near[a].clone().map(|i| self.profile.steepness(at[a] - f64::from(i))).sum()
         };
@@ -293,7 +293,7 @@ impl Rounding {
                 let unit = 1.05 * largest * d / f64::from(1u32 << 30);
                 (16.0 * ULP, 0.5 * unit * voxels * layers * sections)
             }
-            // Those of one sheet: no more layers than reach into it.
+            // Roundings of one sheet: only the layers that reach into it add.
             None => ((16.0 + voxels * (2.0 * profile.radius + d + 1.0)) * ULP, 0.0),
         };
         let a = -libm::expm1(-tau);

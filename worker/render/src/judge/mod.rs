@@ -1,4 +1,5 @@
-//! How far pictures are from the limit of thin sheets and exact arithmetic.
+//! Measures the error of pictures: their distance from the limit of thin sheets and exact
+//! arithmetic.
 
 pub mod analytic;
 pub mod error_probe;

@@ -76,8 +76,8 @@ impl Weight for i16 {
     }
 }
 
-/// How contributions are added: a section is `payload * w_z`, a row `section * w_y`, and what is
-/// added to a pixel `row * w_x`, rounded as each kind says.
+/// Arithmetic of contributions: a section is `payload * w_z`, a row is `section * w_y`, and a pixel
+/// gets `row * w_x`. Each kind of sums has its own rounding.
 pub trait Accumulate: Sum {
     /// A weight across the view axis.
     type Weight: Weight;

@@ -2,9 +2,9 @@
 //! sections at once.
 //!
 //! A record has N sheets, at least as many as a voxel has sections, which for sheets of a vox are
-//! four. Four sheets of 16-bit sums are 32 bytes, one register of AVX2; 32-bit sums take twice that.
-//! Compilers do not make vector instructions of the plain loop: with AVX-512 it took eight times as
-//! long as the loops in `wide`, which must equal it.
+//! four. Four sheets of 16-bit sums are 32 bytes, one register of AVX2; 32-bit sums take twice
+//! that. Compilers do not make vector instructions of the plain loop: with AVX-512 it took eight
+//! times as long as the loops in `wide`, which must equal it.
 
 use super::{Accumulate, Level, Simd, Tap, section_fixed, whole};
 use crate::primitives::footprint::{Footprint, Sections};
@@ -347,7 +347,7 @@ mod wide {
                 // SAFETY: the caller has four channels and two weights there.
                 let (payload, wz) =
                     unsafe { (_mm_loadu_ps(payload.cast()), _mm256_set_m128(_mm_set1_ps(*wz.add(1)), _mm_set1_ps(*wz))) };
-                // As `Section::new`: no section is negative or NaN.
+                // No section is negative or NaN, as in `Section::new`.
                 _mm256_max_ps(_mm256_mul_ps(_mm256_set_m128(payload, payload), wz), _mm256_setzero_ps())
             }
             fn all(weight: Tap) -> __m256 { _mm256_set1_ps(weight.get()) }
@@ -374,7 +374,7 @@ mod wide {
                 // SAFETY: the caller has four channels and four weights there, 16 bytes each.
                 let (payload, wz) = unsafe { (_mm_loadu_ps(payload.cast()), _mm_loadu_ps(wz)) };
                 let wz = _mm512_permutexvar_ps(each, _mm512_castps128_ps512(wz));
-                // As `Section::new`: no section is negative or NaN.
+                // No section is negative or NaN, as in `Section::new`.
                 _mm512_max_ps(_mm512_mul_ps(_mm512_broadcast_f32x4(payload), wz), _mm512_setzero_ps())
             }
             fn all(weight: Tap) -> __m512 { _mm512_set1_ps(weight.get()) }
@@ -420,8 +420,8 @@ mod wide {
     compiled!(longs, "avx2", Longs, i32);
     compiled!(wide_longs, "avx512f,avx512vl,avx512dq,avx512bw", WideLongs, i32);
 
-    /// Footprints of `WIDE` columns, whose weights stay in registers, or of any number where that is
-    /// 0.
+    /// Footprints of `WIDE` columns, whose weights stay in registers, or of any number where that
+    /// is 0.
     ///
     /// # Safety
     /// The caller is compiled for the instructions of `R`.

@@ -1,8 +1,9 @@
 //! The listing for fields, plainly: planes of values and derivatives over a whole frame, on one
 //! thread.
 //!
-//! As in [`serial`](super::serial) nothing is culled and nothing is tiled. It shares with the tile
-//! renderer the weights and what a pair of planes becomes ([`crate::kernels::composite::field`]).
+//! Nothing is culled and nothing is tiled, as in [`serial`](super::serial). It shares two things
+//! with the tile renderer: the weights, and the compositing of a pair of planes
+//! ([`crate::kernels::composite::field`]).
 
 use crate::kernels::Simd;
 use crate::kernels::composite::field::{FieldRule, FieldScene};
@@ -100,7 +101,8 @@ pub(super) fn render<S: FieldSum>(
     state.to_picture()
 }
 
-/// Adds the segment between two planes of the pixel at column `x` and row `y` to pixel `i` of `out`.
+/// Adds the segment between two planes of the pixel at column `x` and row `y` to pixel `i` of
+/// `out`.
 pub(super) fn close<S: FieldSum>(
     frame: &Frame,
     (rule, scene): (&FieldRule, &FieldScene),

@@ -68,7 +68,7 @@ pub struct Part<'a> {
     pub(crate) tile: Rect,
     pub(crate) slab: SheetRange,
     pub(crate) bricks: BrickSource<'a>,
-    /// Of [`BrickSource::Here`]: indices of the bricks that lie over the part, front to back.
+    /// Indices of the bricks of [`BrickSource::Here`] that lie over the part, front to back.
     pub(crate) inside: &'a [u32],
 }
 
@@ -189,9 +189,9 @@ impl Part<'_> {
         }
     }
 
-    /// Counts sheet `k` at the pixels of a row that was closed, given by their places in the part, as
-    /// one that was read where it held something. A bit each: those that were open, and those that are
-    /// shut now.
+    /// Counts sheet `k` at the pixels of a row that was closed, given by their places in the part,
+    /// as one that was read where it held something. A bit each: those that were open, and those
+    /// that are shut now.
     #[cold]
     pub(crate) fn count_sheet(
         &self,

@@ -33,8 +33,8 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 /// Offsets of sections and rows of a kernel that leans ([`slabcast_common::kernel`]).
 #[derive(Debug)]
 pub struct Leaning {
-    /// How far each section lies beside its voxel along x and y, in vox: as [`Sections::all`] has
-    /// weights.
+    /// Distance of each section from its voxel along x and y, in vox, in the order of the weights
+    /// of [`Sections::all`].
     aside: [Vec<f64>; 2],
     /// Offsets in subpixels, in orthographic views.
     subpixels: [Vec<i32>; 2],
@@ -50,8 +50,8 @@ impl Leaning {
     /// Fields have planes, other scenes have sections.
     pub(crate) fn new(view: &View, deep: &Profile, sections: &Sections, scale: f64) -> Leaning {
         let (lean, thickness) = (&view.kernel_lean, view.thickness);
-        // Where two spacings are alike but for their last digits rows and sections lie aside by
-        // less than positions are rounded: that is nothing.
+        // Two spacings that differ in their last digits move rows and sections by less than the
+        // rounding of positions. That counts as no lean.
         let shows = |vox: f64| vox * scale * f64::from(SUBPIXELS) >= 1.0;
         let row = if shows(lean.row.abs() * view.kernel_radius.y) { lean.row_fixed() } else { 0 };
         let slopes =
@@ -108,7 +108,7 @@ impl Leaning {
         [x + row.abs() * f64::from(reach + 1), y]
     }
 
-    /// How far the middle of a row moves along x for each row, in units of 2^-16.
+    /// Returns the distance that the middle of a row moves along x for each row, in units of 2^-16.
     #[inline(always)]
     pub(crate) fn row(&self) -> i64 {
         self.row
@@ -442,7 +442,7 @@ impl Footprints {
     #[inline]
     pub fn at(&self, k: i32) -> Option<Footprint<'_>> {
         let scale = self.view.scale_at(k)?;
-        // Where one table serves all sheets, windows are moved to lie inside a part.
+        // If one table serves all sheets, windows are moved to lie inside a part.
         let (slot, padded) = match self.view.projection {
             Projection::Ortho { .. } => (self.tables.first(), true),
             Projection::Persp { .. } => (self.tables.get((k - self.first) as usize), false),

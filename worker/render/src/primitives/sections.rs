@@ -22,7 +22,7 @@ pub struct Sections {
     weights: Vec<f32>,
     /// Weights over the thickness, in lattice steps, as [`fixed`] point.
     fixed: Vec<i16>,
-    /// The same for the four channels of a field, value and derivatives; empty where sheets hold
+    /// Weights for the four channels of a field, value and derivatives; empty if sheets hold
     /// sections.
     pub(super) field: FieldTaps,
     pub(super) stride: usize,
@@ -47,7 +47,7 @@ pub(super) fn fixed(w: f64) -> i16 {
 
 /// Reach of a kernel in phases.
 fn whole_phases(profile: &Profile, thickness: f64, phases: i32) -> i32 {
-    // What f64 leaves above an integer is not a phase more.
+    // A rounding error above an integer does not count as another phase.
     libm::ceil(profile.radius / thickness * f64::from(phases) * (1.0 - 1e-12)) as i32
 }
 
@@ -55,7 +55,7 @@ fn whole_phases(profile: &Profile, thickness: f64, phases: i32) -> i32 {
 /// `None` where they are no slivers.
 fn kept(profile: &Profile, thickness: f64, phases: i32) -> Option<(i32, i32)> {
     let radius = whole_phases(profile, thickness, phases);
-    // As many whole sheets as are shorter than the kernel, in its middle.
+    // The whole sheets that fit into the kernel's middle.
     let inner = (2 * radius - 1) / phases * (phases / 2);
     let beyond = profile.integral_to(-f64::from(inner) / f64::from(phases) * thickness);
     let ahead = (phases / AHEAD).min(radius - inner);
@@ -87,7 +87,7 @@ impl Sections {
         for p in 0..phases {
             let (first, count) = sections.span(p);
             let at = f64::from(p) / f64::from(phases);
-            // What lies beyond the outermost planes is theirs.
+            // Weight beyond the outermost planes belongs to them.
             let up_to = |plane: u32| match plane {
                 0 => 0.0,
                 n if n >= count => 1.0,

@@ -85,8 +85,8 @@ fn ray(view: &View, [x, y]: [u32; 2]) -> (DVec3, DVec3, f64) {
     }
 }
 
-/// Where a pixel's ray enters the box of voxels and leaves it, in vox along it: of its meetings with
-/// six planes those that lie in the box.
+/// Returns the distances, in vox along a pixel's ray, at which it enters and leaves the box of
+/// voxels: among its intersections with six planes, those that lie in the box.
 fn through_box(asked: &JudgedScene, pixel: [u32; 2]) -> Option<(f64, f64)> {
     let (from, along, start) = ray(&asked.view, pixel);
     let m = asked.view.eye_from_index.inverse();
@@ -514,7 +514,7 @@ fn field_is_the_weighted_mean_of_all_voxels() {
                 (reference.value_at(eye + d * h) - reference.value_at(eye - d * h)) / (2.0 * h)
             });
             let got = reference.gradient_at(eye);
-            // Where a kernel ends the slope jumps.
+            // The slope jumps at the end of a kernel.
             let off = (got - DVec3::from_array(slope)).length();
             assert!(off < 1e-3 * (1.0 + got.length()), "{p}: {got}, want {slope:?}");
         }

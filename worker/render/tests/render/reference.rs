@@ -111,7 +111,7 @@ fn by_brute_force(
         f64::from(y) + 0.5 - f64::from(view.size[1]) / 2.0,
     );
     use slabcast_common::view::Projection::{Ortho, Persp};
-    // Where the ray is at a distance along it.
+    // Position on the ray at a distance along it.
     let (origin, direction, from) = match view.projection {
         Ortho { scale } => (DVec3::new(px / scale, py / scale, 0.0), DVec3::Z, -1e9),
         Persp { focal, distance } => {
@@ -359,7 +359,7 @@ fn reference_sheared_kernels_equal_brute_force_in_index_space() {
         vec![[0.0, 0.0], [10.0, 10.0 * sigma]],
         OpacityUnit::Extinction,
     );
-    // What is beyond so far is nothing.
+    // The kernel is nothing beyond a radius of 3.6.
     let q = Quality { std, radius: 3.6, ..i32_sums() };
     for lattice in lattices(n) {
         volume.lattice = lattice;

@@ -31,7 +31,7 @@ fn lit() -> TransferFunction {
     tf
 }
 
-/// How far what is splatted is from what the reference makes of the same pixels, `n` of them.
+/// Returns the errors of the splatted picture against the reference, over `n` pixels.
 fn figures(
     asked: &JudgedScene,
     n: usize,

@@ -33,8 +33,8 @@ fn footprint_cost_counts_pixels_and_bytes() {
     assert_eq!(adds(Sums::I16, 1.0, deep), None);
 }
 
-/// Of voxels that were culled and of sheets that were not come to, too: what is left would be added
-/// to another part.
+/// Checks records after culled voxels and unreached sheets, too: anything left would be added to
+/// another part.
 #[test]
 fn records_are_empty_between_parts() {
     let volume = Volume::from_fn_u8("ball", [40; 3], |i, j, k| {

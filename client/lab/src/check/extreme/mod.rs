@@ -143,7 +143,7 @@ fn cameras() -> Vec<Case> {
         one("along +x", seen(|v| ortho_camera(v, [1.0, 0.0, 0.0], UP))),
         one("along -y", seen(|v| ortho_camera(v, [0.0, -1.0, 0.0], UP))),
         one("along +z, up along it too", seen(|v| ortho_camera(v, [0.0, 0.0, 1.0], UP))),
-        // Where a turntable's elevation of 90 degrees puts the eye.
+        // The eye of a turntable with an elevation of 90 degrees.
         one("the pole of a turntable", seen(|v| ortho_camera(v, UP, [0.0, -1.0, 0.0]))),
         one(
             "along +z, perspective",

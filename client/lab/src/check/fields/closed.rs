@@ -1,10 +1,11 @@
 //! Fields whose pictures are known on paper.
 //!
-//! A cubic B-spline reconstructs constants and, along the lattice's axes, linear functions exactly. So a
-//! solid block's opacity is that of the chord that a ray cuts from it, and a ramp is what it is inside a
-//! cropping box that keeps away from the volume's faces. A turned kernel moves a ramp by up to
-//! [`TURNED_RAMP`]. Plates seen edge on are sums of B-splines. Rays and chords are computed here, from
-//! the camera's eye, target and height, and share no code with the renderer's cameras.
+//! A cubic B-spline reconstructs constants and, along the lattice's axes, linear functions exactly.
+//! So a solid block's opacity is that of the chord that a ray cuts from it, and a ramp is what it
+//! is inside a cropping box that keeps away from the volume's faces. A turned kernel moves a ramp
+//! by up to [`TURNED_RAMP`]. Plates seen edge on are sums of B-splines. Rays and chords are
+//! computed here, from the camera's eye, target and height, and share no code with the renderer's
+//! cameras.
 
 use crate::check::case::{Case, Row};
 use crate::check::shot::{Shot, Tools, sane};
@@ -18,25 +19,26 @@ use slabcast_session::direct::Cut;
 use slabcast_session::fail::Fail;
 use std::sync::Arc;
 
-/// Largest error of an opacity that depends on a chord alone, in 1/255. Ends of chords have some four
-/// roundings of f32 at 40 vox, 1e-5 vox; of a chord of [`GRAZING`] that is 1e-3, of which opacity takes
-/// at most 0.37.
+/// Largest error of an opacity that depends on a chord alone, in 1/255. Ends of chords have some
+/// four roundings of f32 at 40 vox, 1e-5 vox; of a chord of [`GRAZING`] that is 1e-3, of which
+/// opacity takes at most 0.37.
 const CHORDS: f64 = 0.1;
 
 /// Shortest chord that is judged, in vox: the error of a shorter one is not small beside it.
 const GRAZING: f64 = 0.01;
 
-/// Largest error where the value decides: positions are rounded to 1/512 pixel, and a sub-step takes the
-/// value as linear. Slopes here are at most 0.25 of the extinction a vox and 4 pixels a vox, so
-/// 1/2048 vox changes a pixel by 0.03; sub-steps may cost 0.05. In 1/255.
+/// Largest error where the value decides: positions are rounded to 1/512 pixel, and a sub-step
+/// takes the value as linear. Slopes here are at most 0.25 of the extinction a vox and 4 pixels a
+/// vox, so 1/2048 vox changes a pixel by 0.03; sub-steps may cost 0.05. In 1/255.
 const VALUES: f64 = 0.1;
 
-/// How far a turned B-spline moves a ramp, in vox: its first moment has waves with the period of the
-/// lattice. 0.054 was the largest seen; the limit has them too.
+/// Bound on the distance by which a turned B-spline moves a ramp, in vox: its first moment has
+/// waves with the period of the lattice. 0.054 was the largest seen; the limit of thin sheets has
+/// these waves, too.
 const TURNED_RAMP: f64 = 0.06;
 
-/// How much of its light a lit ramp may lose or gain by these waves, whose slope turns the normal by
-/// 0.7 degrees. In 1/255.
+/// Bound on the light that a lit ramp loses or gains by the waves of [`TURNED_RAMP`], in 1/255:
+/// their slope turns the normal by 0.7 degrees.
 const TURNED_LIGHT: f64 = 2.0;
 
 /// Steps of the closed forms' own integrals.
@@ -139,8 +141,8 @@ fn look(colors: Vec<[f64; 4]>, opacities: &[[f64; 2]]) -> TransferFunction {
     }
 }
 
-/// Draws `shot` and returns two rows, of opacity and of colour, against `want`, which has the linear
-/// premultiplied pixel of a ray, or nothing where it is not judged.
+/// Draws `shot` and returns two rows, of opacity and of colour, against `want`, which has the
+/// linear premultiplied pixel of a ray, or nothing where it is not judged.
 fn compare(
     shot: &Shot,
     tools: &Tools,
@@ -220,7 +222,8 @@ fn ramp(name: &'static str, opacities: &'static [[f64; 2]], lit: bool) -> Case {
             let shot = Shot { crop: Some(crop), ..shot(ramp, transfer, view) };
             let straight = view.1.iter().filter(|&&x| x != 0.0).count() == 1;
             if lit && straight {
-                // The gradient lies across the ray: which side faces the eye is a matter of rounding.
+                // The gradient lies across the ray: which side faces the eye is a matter of
+                // rounding.
                 continue;
             }
             let steepest = slope(opacities);
@@ -243,15 +246,15 @@ fn ramp(name: &'static str, opacities: &'static [[f64; 2]], lit: bool) -> Case {
     })
 }
 
-/// How much a pixel may change, as a share of full light, where the ramp moves by one vox: by the
-/// extinction of a jump, or by the colour, which goes from end to end in 16 vox.
+/// Returns a bound on the change of a pixel, as a share of full light, if the ramp moves by one
+/// vox: by the extinction of a jump, or by the colour, which goes from end to end in 16 vox.
 fn slope(points: &[[f64; 2]]) -> f64 {
     let jump = points[0][0] == points[1][0];
     f64::max(if jump { points[1][1] } else { 0.0 }, 1.0 / 16.0)
 }
 
-/// The light on a gradient of (1, 0, 0) code a vox, of 24 codes in all, turned towards the eye and by a
-/// share of 1/1020 of the codes towards it.
+/// The light on a gradient of (1, 0, 0) code a vox, of 24 codes in all, turned towards the eye and
+/// by a share of 1/1020 of the codes towards it.
 fn lambert(to_eye: DVec3, to_light: DVec3) -> f64 {
     let side = if to_eye.x < 0.0 { -1.0 } else { 1.0 };
     let normal = (DVec3::X * side + to_eye * (24.0 / 1020.0)).normalize();
@@ -270,8 +273,8 @@ fn extinction(points: &[[f64; 2]], x: f64) -> f64 {
     }
 }
 
-/// Integrates extinction and colour from one distance to the next by midpoints: linear premultiplied
-/// RGBA.
+/// Integrates extinction and colour from one distance to the next by midpoints: linear
+/// premultiplied RGBA.
 fn along(ends: [f64; 2], at: impl Fn(f64) -> (f64, [f64; 3])) -> [f64; 4] {
     let step = (ends[1] - ends[0]) / f64::from(STEPS);
     let (mut rgb, mut depth) = ([0.0; 3], 0.0);

@@ -54,7 +54,7 @@ pub(crate) struct Transfer {
     pub(crate) bytes: u64,
 }
 
-/// How bricks get to a worker.
+/// Rule by which bricks are sent to a worker.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Mode {
     /// The worker is sent every brick that the slab needs.

@@ -18,7 +18,8 @@ use slabcast_common::volume::{
 use std::path::Path;
 use std::sync::Arc;
 
-/// Hears how far a pass over a volume is: bytes done and bytes in all. An error ends the work.
+/// Callback for the progress of a pass over a volume: bytes done and bytes in all. An error ends
+/// the work.
 pub type OnProgress<'a> = dyn FnMut(u64, u64) -> Result<(), Problem> + 'a;
 
 /// A volume that was written as OME-Zarr.
@@ -30,17 +31,17 @@ pub struct Converted {
     pub notes: Vec<String>,
 }
 
-/// Reads a volume of any format and writes it as OME-Zarr at `to`, a folder that is made. Its samples
-/// keep type and value; each coarser level has means of two samples along each axis. Files whose samples
-/// lie in order are read slice by slice, whatever their size; others are read as a whole first. With
-/// `replace`, a Zarr folder that is at `to` goes when the new one is whole.
+/// Converts a volume of any format to OME-Zarr in the new folder `to`. Samples keep their type and
+/// value; each coarser level has means of two samples along each axis. Files with their samples in
+/// order are read slice by slice, whatever their size; others are read as a whole first. With
+/// `replace`, a Zarr folder at `to` is removed once the new one is complete.
 ///
-/// `on_progress` hears about each pass: one for integers of 8 and 16 bits, two for others, and more
-/// for floats with values far from all others.
+/// `on_progress` is called during each pass. Integers of 8 and 16 bits need one pass, other types
+/// two, and floats with outliers more.
 ///
 /// # Errors
-/// The volume can't be read, `to` is there already or can't be written, the memory does not do, or
-/// `on_progress` returned an error. Nothing is left at `to` then.
+/// The volume can't be read, `to` exists or can't be written, memory is short, or `on_progress`
+/// returned an error. Then nothing is left at `to`.
 pub fn convert(
     from: &Path,
     to: &Path,
@@ -55,7 +56,7 @@ pub fn convert(
     Ok(Converted { levels, notes })
 }
 
-/// Writes planes as OME-Zarr.
+/// Writes planes as OME-Zarr in the new folder `to`; returns the levels, the finest first.
 pub(crate) fn write(
     planes: &Planes,
     to: &Path,
@@ -86,17 +87,18 @@ pub(crate) fn write(
     let folder = builder.tempdir_in(parent).map_err(|e| written(parent, &e))?;
     let levels = fill(planes, folder.path(), &name, on_progress)?;
     if !is_free()? {
-        // Folders can't replace others; the old one goes out of the way, and then for good.
+        // A rename can't replace a folder with files, so the old one is moved away and removed
+        // later.
         let old = builder.tempdir_in(parent).map_err(|e| written(parent, &e))?;
         std::fs::rename(to, old.path().join("old")).map_err(|e| written(to, &e))?;
     }
     std::fs::rename(folder.path(), to).map_err(|e| written(to, &e))?;
-    // It has another name now.
+    // The folder was renamed to `to`, so it must not be removed as a temporary one.
     let _ = folder.keep();
     Ok(levels)
 }
 
-/// Writes all files of a pyramid into a folder.
+/// Writes all files of a pyramid into a folder: metadata, levels and sidecar.
 fn fill(
     planes: &Planes,
     folder: &Path,
@@ -119,7 +121,7 @@ fn fill(
     }
     put(&folder.join("zarr.json"), &meta::group(name, &lattices, &own))?;
     let walked = walk(planes, &lattices, Some(writers), on_progress)?;
-    // Bins that were not known in the pass: blocks are looked at again.
+    // The pass guessed other bins, or dropped the sets of codes: all blocks are read again.
     let facts = match walked.facts {
         Ok(facts) => facts,
         Err(unfinished) => source::complete(folder, unfinished)?,
@@ -131,7 +133,7 @@ fn fill(
     Ok(infos(&lattices, &facts))
 }
 
-/// Returns the levels as others know them.
+/// Returns the descriptions of all levels, the finest first.
 pub(crate) fn infos(lattices: &[Lattice], facts: &Facts) -> Vec<VolumeInfo> {
     let finest_vox = lattices[0].vox();
     let info = |(level, (lattice, of)): (u32, (&Lattice, &LevelFacts))| VolumeInfo {
@@ -149,7 +151,8 @@ fn put(path: &Path, json: &serde_json::Value) -> Result<(), Problem> {
     std::fs::write(path, text).map_err(|e| written(path, &e))
 }
 
-/// Hands all files to the disk, so that a folder with its final name is whole even after a power cut.
+/// Syncs all files of a folder to the disk, so that a folder with its final name is complete even
+/// after a power cut.
 fn sync(folder: &Path) -> std::io::Result<()> {
     for entry in std::fs::read_dir(folder)? {
         let entry = entry?;
@@ -161,13 +164,13 @@ fn sync(folder: &Path) -> std::io::Result<()> {
     Ok(())
 }
 
-/// What a pass over all numbers found.
+/// Result of the passes over all numbers of a volume.
 pub(crate) struct Walked {
-    /// Facts; without blocks where a second look is needed.
+    /// Facts, or facts without block summaries if all blocks must be read again.
     pub(crate) facts: Result<Facts, Unfinished>,
 }
 
-/// Facts whose blocks have to be looked at again.
+/// Facts without block summaries: all blocks must be read again.
 pub(crate) struct Unfinished {
     pub(crate) coding: Coding,
     pub(crate) summary: ValueSummary,
@@ -175,7 +178,7 @@ pub(crate) struct Unfinished {
 }
 
 impl Unfinished {
-    /// Returns the facts with blocks of which nothing is known yet.
+    /// Returns facts with empty block summaries, to open the levels with.
     pub(crate) fn blind(&self, lattices: &[Lattice]) -> Facts {
         let bins = ValueBins::of(&self.summary);
         let blocks = |lattice: &Lattice| {
@@ -189,8 +192,8 @@ impl Unfinished {
     }
 }
 
-/// Goes over the numbers of a volume: once for their range if codes depend on it, and once for all
-/// else.
+/// Makes and surveys the levels of a volume: one pass for the range of its numbers if codes depend
+/// on it, one for everything else. `writers`, one for each level, write them.
 pub(crate) fn walk(
     planes: &Planes,
     lattices: &[Lattice],
@@ -265,7 +268,8 @@ fn recount(
     Ok(histogram)
 }
 
-/// Returns the facts of levels that were surveyed.
+/// Returns the facts of surveyed levels. `recount` counts codes again for
+/// [`ValueSummary::find_core`].
 pub(crate) fn facts(
     coding: Coding,
     (anatomical, finest_vox): (bool, f64),
@@ -286,7 +290,7 @@ pub(crate) fn facts(
     Ok(Ok(Facts { coding, summary, levels }))
 }
 
-/// Looks at all blocks of all levels of a source.
+/// Computes the missing block summaries; reads all blocks of all levels of `source`.
 pub(crate) fn blocks_again(
     source: &dyn BlockSource,
     unfinished: Unfinished,

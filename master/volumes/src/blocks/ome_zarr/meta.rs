@@ -1,4 +1,4 @@
-//! Metadata of the pyramids that we write: OME-Zarr 0.5 in Zarr 3.
+//! Metadata of the pyramids that slabcast writes: OME-Zarr 0.5 in Zarr 3.
 
 use super::write::{chunk_shape, shard_chunks};
 use crate::samples::Number;
@@ -6,13 +6,14 @@ use crate::zarr::Own;
 use serde_json::{Value, json};
 use slabcast_common::volume::Lattice;
 
-/// Returns a list in the order of the array's axes: z, y, x.
+/// Reorders x, y, z to the order of the array's axes: z, y, x.
 fn zyx<T: Copy>([x, y, z]: [T; 3]) -> [T; 3] {
     [z, y, x]
 }
 
-/// Returns the position of sample (0, 0, 0) of each level along the array's own axes, in mm: the origin
-/// if the axes are those of the world. Directions are in our own attribute.
+/// Returns the position of sample (0, 0, 0) of each level along the array's own axes, in mm: the
+/// lattice's origin if these are the world's axes, else relative to level 0. Directions are in
+/// slabcast's own attribute ([`Own`]).
 fn translations(lattices: &[Lattice]) -> Vec<[f64; 3]> {
     let first = &lattices[0];
     let straight = (0..3).all(|a| {

@@ -1,4 +1,4 @@
-//! OME-Zarr: the file with a pyramid. [`convert`] writes it, [`OmeZarrSource`] reads it by chunks.
+//! OME-Zarr pyramids: [`convert`] writes them, [`OmeZarrSource`] reads them by chunks.
 
 mod convert;
 mod meta;
@@ -10,8 +10,8 @@ pub(crate) use convert::{blocks_again, infos, walk, write as write_pyramid};
 pub use source::{OmeZarrSource, level_sizes};
 pub(crate) use write::{LevelWriter, packed};
 
-/// Sidecar in the folder of a pyramid that we wrote. It is in an array's folder, whose other files no
-/// program looks at.
+/// Path of the sidecar in a pyramid that slabcast wrote. It is in an array's folder, where programs
+/// look only for metadata and chunks.
 const SIDECAR: &str = "0/.slabcast-blocks";
 
 #[cfg(test)]

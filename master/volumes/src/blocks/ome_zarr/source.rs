@@ -1,4 +1,4 @@
-//! An OME-Zarr pyramid or a Zarr array as a source of boxes.
+//! Source of boxes from an OME-Zarr pyramid or a Zarr array.
 
 use super::convert::{Unfinished, blocks_again, facts, guess, infos};
 use super::{OnProgress, SIDECAR};
@@ -20,15 +20,15 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::UNIX_EPOCH;
 
-/// Bytes of decoded chunks that are kept unless [`OmeZarrSource::with_cache_bytes`] says otherwise.
+/// Default budget of decoded chunks in bytes; [`OmeZarrSource::with_cache_bytes`] changes it.
 const CACHE_BYTES: usize = 64 << 20;
-/// Chunks that are decoded at a time for one box.
+/// Chunks of one box that are decoded at once.
 const AT_A_TIME: usize = 32;
 
-/// A pyramid whose chunks are read when they are asked for.
+/// A pyramid of which chunks are read on request.
 ///
-/// Errors name the chunk's file. A file that is gone, cut off, damaged or replaced since the pyramid was
-/// opened is an error of the boxes that it holds.
+/// Errors name the chunk's file. If a file was removed, cut off, damaged or replaced since the
+/// pyramid was opened, boxes that need it fail; others can still be read.
 pub struct OmeZarrSource {
     name: String,
     file_type: String,
@@ -41,7 +41,7 @@ pub struct OmeZarrSource {
     cache: Mutex<ChunkCache>,
 }
 
-/// A pyramid of which only the metadata were read.
+/// A pyramid whose metadata were read and whose files were listed, before its blocks are known.
 struct Opening {
     name: String,
     folder: PathBuf,
@@ -50,7 +50,7 @@ struct Opening {
     lattices: Vec<Lattice>,
     listing: Arc<Listing>,
     stamps: Vec<(PathBuf, Stamp)>,
-    /// `--max-bytes`.
+    /// Most bytes of samples that the user allows (`--max-bytes`).
     max_bytes: Option<u64>,
 }
 
@@ -94,8 +94,8 @@ impl Opening {
         })
     }
 
-    /// Returns what tells this pyramid from others, with or without times: paths and sizes of all
-    /// files, and the metadata.
+    /// Returns the identity of the pyramid: a digest of paths and sizes of all files, their times
+    /// of change if `times`, the metadata, and which of several volumes is read.
     fn identity(&self, times: bool) -> Result<Identity, Problem> {
         let mut hash = Sha256::new();
         hash.update(b"slabcast pyramid 1");
@@ -112,7 +112,7 @@ impl Opening {
                 hash.update(text.map_err(|e| Problem::io(path, &e))?);
             }
         }
-        // Which of several volumes is read.
+        // Index of the volume among several.
         for reader in &self.readers {
             reader.placed().at.iter().for_each(|n| hash.update(n.to_le_bytes()));
         }
@@ -123,7 +123,7 @@ impl Opening {
         self.own.as_ref().and_then(|own| own.rescale).unwrap_or(ValueMap::IDENTITY)
     }
 
-    /// Calls `each` with the numbers of slabs of 64 planes of a level, in order.
+    /// Calls `each` with the numbers of each slab of 64 planes of a level, in order.
     fn slabs(
         &self,
         level: usize,
@@ -137,8 +137,8 @@ impl Opening {
         Ok(())
     }
 
-    /// Checks that the files of this picture may have so many bytes of samples. Chunks that are not there
-    /// are read, too, and a size in the metadata is cheap.
+    /// Checks that files of this size may become so many bytes of samples: missing chunks count as
+    /// fill values, so metadata alone can claim any size.
     fn check_size(&self, samples: u64) -> Result<(), Problem> {
         let stored = self.listing.files().map(|(_, stamp)| stamp.len).sum::<u64>();
         let most = self.max_bytes.unwrap_or(ANY_FILE_BYTES.max(stored.saturating_mul(FILE_RATIO)));
@@ -156,7 +156,7 @@ impl Opening {
         }
     }
 
-    /// Looks at all samples of all levels.
+    /// Surveys all levels; reads all samples.
     fn survey(&self, on_progress: &mut OnProgress<'_>) -> Result<Facts, Problem> {
         let number = self.readers[0].array().number;
         let bytes =
@@ -210,8 +210,8 @@ impl Opening {
     }
 }
 
-/// Returns samples and spacing along x, y and z of each level of the pyramid in a folder; `None` for
-/// anything else. Reads metadata alone.
+/// Returns the number of samples and the spacing along x, y and z of each level of the pyramid in a
+/// folder; `None` if it is not a pyramid. Reads only metadata.
 pub fn level_sizes(folder: &Path) -> Option<Vec<([u64; 3], [f64; 3])>> {
     if !folder.is_dir() || !crate::zarr::is_node(folder) {
         return None;
@@ -224,7 +224,7 @@ pub fn level_sizes(folder: &Path) -> Option<Vec<([u64; 3], [f64; 3])>> {
     (0..picture.levels()).map(size).collect()
 }
 
-/// Checks that a level has chunks in a number and size that can be read one by one.
+/// Checks that the chunks of a level are few and small enough to be read one by one.
 fn check_chunks(reader: &LevelReader) -> Result<(), Problem> {
     reader.array().check_counts(reader.placed())
 }
@@ -234,13 +234,13 @@ fn is_metadata(path: &str) -> bool {
     ["zarr.json", ".zarray", ".zattrs", ".zgroup"].contains(&name)
 }
 
-/// Returns the identity of a pyramid for a sidecar in its folder, which is copied with it: without
-/// times.
+/// Returns the identity of a pyramid for a sidecar in its own folder. It has no times of change, so
+/// that it holds for a copy of the folder.
 pub(super) fn identity_inside(folder: &Path) -> Result<Identity, Problem> {
     Opening::new(folder, &Hints::default())?.identity(false)
 }
 
-/// Looks again at the blocks of a pyramid, of which all else is known.
+/// Computes the missing block summaries of a pyramid in a folder; reads all its samples.
 pub(super) fn complete(folder: &Path, unfinished: Unfinished) -> Result<Facts, Problem> {
     let opening = Opening::new(folder, &Hints::default())?;
     let blind = unfinished.blind(&opening.lattices);
@@ -254,12 +254,13 @@ impl OmeZarrSource {
         OmeZarrSource { name: name.into(), file_type: file_type.into(), ..self }
     }
 
-    /// Opens a pyramid or an array in a folder. What is known of its blocks comes from the sidecar in
-    /// its folder or in `cache`; without one, all samples are read once, which `on_progress` hears
-    /// about, and a sidecar is put into `cache`.
+    /// Opens a pyramid or an array in a folder. Block summaries come from the sidecar in its folder
+    /// or in `cache`. Without one, a pass reads all samples, calls `on_progress`, and writes a
+    /// sidecar into `cache`.
     ///
     /// # Errors
-    /// The folder is no pyramid that can be read, or is damaged; `on_progress` returned an error.
+    /// The folder is not a pyramid that can be read, it is damaged, or `on_progress` returned an
+    /// error.
     pub fn open(
         folder: &Path,
         hints: &Hints,
@@ -281,7 +282,7 @@ impl OmeZarrSource {
                     None => {
                         let facts = opening.survey(on_progress)?;
                         if let Some(path) = &beside {
-                            // A cache that can't be written is none.
+                            // Without a writable cache the next run surveys the pyramid again.
                             let _ = facts.write(path, &identity);
                         }
                         facts
@@ -319,7 +320,7 @@ impl OmeZarrSource {
         }
     }
 
-    /// Returns the source with room for so many bytes of decoded chunks.
+    /// Returns the source with another budget of decoded chunks, in bytes.
     #[must_use]
     pub fn with_cache_bytes(self, bytes: usize) -> OmeZarrSource {
         OmeZarrSource { cache: Mutex::new(ChunkCache::new(bytes)), ..self }
@@ -329,7 +330,7 @@ impl OmeZarrSource {
         self.cache.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Checks that the metadata are those that were read.
+    /// Checks that no metadata file changed since the pyramid was opened.
     fn check_stamps(&self) -> Result<(), Problem> {
         for (path, stamp) in &self.stamps {
             if Stamp::of_path(path).ok() != Some(*stamp) {
@@ -418,13 +419,13 @@ fn cells(shape: [u32; 3], lo: [u32; 3], hi: [u32; 3]) -> Vec<[u32; 3]> {
     cells
 }
 
-/// Returns the box of a chunk, as far as it lies in the level.
+/// Returns the part of a chunk's box that lies in the level, from `lo` to `hi` (exclusive).
 fn chunk_box(at: [u32; 3], shape: [u32; 3], dims: [u32; 3]) -> ([u32; 3], [u32; 3]) {
     let lo = std::array::from_fn(|a| at[a] * shape[a]);
     (lo, std::array::from_fn(|a| (lo[a] + shape[a]).min(dims[a])))
 }
 
-/// Returns a box of one code.
+/// Returns the samples of a box that all have one code, the first of `fill`.
 fn filled(fill: &Samples, lo: [u32; 3], hi: [u32; 3]) -> Result<Samples, Problem> {
     let count = (0..3).map(|a| (hi[a] - lo[a]) as usize).product();
     macro_rules! of {
@@ -444,7 +445,7 @@ fn filled(fill: &Samples, lo: [u32; 3], hi: [u32; 3]) -> Result<Samples, Problem
 
 type Box3 = ([u32; 3], [u32; 3]);
 
-/// Copies what the boxes of two lists of samples share.
+/// Copies the intersection of two boxes from one list of samples to another.
 pub(crate) fn paste(from: &Samples, from_box: Box3, to: &mut Samples, to_box: Box3) {
     match (from, to) {
         (Samples::U8(from), Samples::U8(to)) => paste_rows(from, from_box, to, to_box, 1),
@@ -454,7 +455,7 @@ pub(crate) fn paste(from: &Samples, from_box: Box3, to: &mut Samples, to_box: Bo
     }
 }
 
-/// Copies what two boxes share; a sample has `size` items.
+/// Copies the intersection of two boxes; a sample has `size` items.
 fn paste_rows<T: Copy>(
     from: &[T],
     (from_lo, from_hi): Box3,
@@ -503,7 +504,7 @@ fn numbers(reader: &LevelReader, lo: [u32; 3], hi: [u32; 3]) -> Result<Vec<u8>, 
     Ok(out)
 }
 
-/// Decoded chunks, those that were used last.
+/// Cache of decoded chunks; the least recently used one is dropped first.
 struct ChunkCache {
     budget: usize,
     bytes: usize,

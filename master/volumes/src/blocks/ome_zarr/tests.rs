@@ -15,7 +15,7 @@ fn raw(kind: &str, value: impl Fn(usize) -> Vec<u8>) -> (String, Vec<u8>) {
     (format!("x_90x70x67_{kind}.raw"), bytes)
 }
 
-/// A mixture that has runs, noise and far-off values.
+/// Returns number `i` of a mixture of runs, noise and far-off values.
 fn mixed(i: usize) -> u64 {
     let noise = (i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40;
     if i / 90 % 70 < 20 { 7 } else { noise }
@@ -271,8 +271,8 @@ fn shape_of_chunks_that_are_not_there_is_refused_with_the_flag() {
     assert!(e.contains("give --max-bytes 8000000000"), "{e}");
 }
 
-/// Metadata, shards and the sidecar with bytes changed, cut off or repeated: an error, or a picture; no
-/// panic.
+/// Metadata, shards and the sidecar with bytes changed, cut off or repeated: an error, or a
+/// picture; no panic.
 #[test]
 fn mutants_of_a_pyramid_are_refused_or_read() {
     let folder = tempfile::tempdir().expect("a folder");

@@ -1,7 +1,7 @@
 //! Writes one level as a Zarr array: chunks of 64^3 in shards of 8 x 8 x 8 chunks.
 //!
-//! A shard grows as slabs come, 64 planes at a time; its index is written when its last plane was.
-//! Chunks of zeros are left out. The others are in Blosc containers of lz4, with a checksum.
+//! A shard grows slab by slab, 64 planes at a time; its index is written after its last plane.
+//! Chunks of zeros are left out. The others are Blosc containers of lz4, with a checksum.
 
 use super::super::survey::SQUARE;
 use super::super::{BLOCK_EDGE, block_dims};
@@ -11,7 +11,7 @@ use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// Writes the chunks of a level in order of z.
+/// Writer of one level, which takes its chunks in order of z.
 pub(crate) struct LevelWriter {
     folder: PathBuf,
     dims: [u32; 3],
@@ -33,7 +33,7 @@ struct ShardState {
 /// Offset and size of a chunk that is not there.
 const MISSING: (u64, u64) = (u64::MAX, u64::MAX);
 
-/// Returns the shape of a level's chunks: 64, or the level's side where that is less.
+/// Returns the shape of a level's chunks: 64 along each axis, or the level's side if that is less.
 pub(super) fn chunk_shape(dims: [u32; 3]) -> [u32; 3] {
     dims.map(|n| n.min(BLOCK_EDGE))
 }
@@ -43,7 +43,7 @@ pub(super) fn shard_chunks(dims: [u32; 3]) -> [u32; 3] {
     block_dims(dims).map(|n| n.min(SQUARE))
 }
 
-/// Returns the chunk of a box of numbers as it is stored; `None` if all are zero.
+/// Packs a box of numbers into a stored chunk; `None` if all numbers are zero.
 pub(crate) fn packed(
     numbers: Vec<u8>,
     size: usize,
@@ -158,7 +158,7 @@ impl LevelWriter {
     }
 }
 
-/// Opens a file to write at its end; a new one is made with its folders.
+/// Opens a file to append to. With `new`, the file and its folders are made.
 fn appended(path: &Path, new: bool) -> Result<File, Problem> {
     if new && let Some(folder) = path.parent() {
         std::fs::create_dir_all(folder).map_err(|e| written(folder, &e))?;

@@ -3,7 +3,7 @@ use crate::dicom::jpeg::tests::lossless;
 use crate::dicom::tests::element;
 use glam::DVec3;
 
-/// A sequence of items, with lengths or with delimiters.
+/// Returns a sequence of items, with lengths or with delimiters.
 fn sequence(tag: Tag, items: &[Vec<u8>], delimited: bool) -> Vec<u8> {
     let mut out = Vec::new();
     out.extend(tag.0.to_le_bytes());
@@ -34,7 +34,8 @@ fn item(elements: &[(Tag, &str, &[u8])]) -> Vec<u8> {
     out
 }
 
-/// A file of frames of 3 x 2 pixels: z, slope and the first of their numbers, which go up by one.
+/// Returns a file of frames of 3 x 2 pixels: z, slope and the first of their numbers, which go up
+/// by one.
 pub(crate) fn enhanced(frames: &[(f64, f64, u16)], packed: bool, delimited: bool) -> Vec<u8> {
     let mut out = vec![0u8; 128];
     out.extend(b"DICM");
@@ -102,7 +103,7 @@ pub(crate) fn enhanced(frames: &[(f64, f64, u16)], packed: bool, delimited: bool
     [&out[..], &table, &items, &DELIMITER].concat()
 }
 
-/// A dose of two frames of 3 x 2 pixels, with numbers from 10 on.
+/// Returns a dose of two frames of 3 x 2 pixels, with numbers from 10 on.
 fn dose(offsets: &str) -> Vec<u8> {
     let mut file = enhanced(&[(0.0, 1.0, 10), (1.0, 1.0, 20)], false, false);
     let start = file.windows(4).position(|w| w == [0x00, 0x52, 0x29, 0x92]).unwrap();

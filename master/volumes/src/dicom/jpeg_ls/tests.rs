@@ -1,6 +1,6 @@
 use super::*;
 
-/// A picture of 20 x 12 pixels of `bits` bits: flat, with two levels; rough; smooth.
+/// Returns a picture of 20 x 12 pixels of `bits` bits: flat, with two levels; rough; smooth.
 fn picture(bits: u32) -> Vec<i64> {
     let most = (1i64 << bits) - 1;
     let pixel = |x: i64, y: i64| match y {
@@ -88,7 +88,7 @@ pub(crate) const ENCODED: [(u32, i64, &str); 6] = [
     ),
 ];
 
-/// The encoded pictures, for the mutants of `fuzz.rs`.
+/// Returns the encoded pictures, for the mutants of `fuzz.rs`.
 pub(crate) fn encoded_pictures() -> Vec<Vec<u8>> {
     ENCODED.iter().map(|(_, _, hex)| bytes(hex)).collect()
 }

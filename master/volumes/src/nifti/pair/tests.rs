@@ -2,7 +2,7 @@ use super::*;
 use crate::fuzz::gzip;
 use crate::nifti::tests::{Affine, nifti1, nifti2};
 
-/// The header and the samples 0, 1, 2, ... of a NIfTI pair.
+/// Returns the header and the samples 0, 1, 2, ... of a NIfTI pair.
 pub(crate) fn nifti_pair(big: bool, datatype: i16, dims: [i16; 3]) -> (Vec<u8>, Vec<u8>) {
     let mut header = nifti1(big, datatype, dims, Affine::Sform);
     let samples = header.split_off(352);
@@ -12,7 +12,7 @@ pub(crate) fn nifti_pair(big: bool, datatype: i16, dims: [i16; 3]) -> (Vec<u8>, 
     (header, samples)
 }
 
-/// A header of ANALYZE 7.5.
+/// Returns a header of ANALYZE 7.5.
 pub(crate) fn analyze(big: bool, datatype: i16, dims: [i16; 3]) -> Vec<u8> {
     let (mut header, _) = nifti_pair(big, datatype, dims);
     header[252..348].fill(0);

@@ -373,7 +373,7 @@ impl General<'_> {
         if frame.leaning.is_some() {
             let mut all = (first..=last).filter_map(at);
             let one = all.next()?;
-            // As below, one that holds no pixel's centre counts, too.
+            // Rectangles without a pixel's centre count, too, as below.
             return Some(all.fold(one, |a, b| {
                 let (x0, y0) = (a.x0.min(b.x0), a.y0.min(b.y0));
                 Rect::new(x0, y0, a.x1.max(b.x1), a.y1.max(b.y1))

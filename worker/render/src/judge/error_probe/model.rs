@@ -8,12 +8,12 @@
 //!
 //! - *positions*: voxels where sheets have them, rounded to a part of a pixel and of a sheet;
 //! - *truncation*: the whole Gaussian, neither cut nor lowered by its edge;
-//! - *ripple*: the field divided by what an endless lattice of ones would be there. That is
-//!   periodic: one and a wave for each vector of the lattice's dual, of which the nearest are
-//!   enough. As high as the kernel's Fourier transform there, by which Poisson's formula has it.
+//! - *ripple*: the field divided by the field of an endless lattice of ones. The divisor is
+//!   periodic: one plus a wave for each vector of the lattice's dual, as high as the kernel's
+//!   Fourier transform there (Poisson's formula). The nearest vectors are enough.
 //!
-//! How far these pictures are from the first one are the errors, up to the coarseness of the steps,
-//! which all of them share.
+//! The errors are the differences of these three pictures from the first one, up to the coarseness
+//! of the steps, which all of them share.
 
 use crate::primitives::footprint::Profile;
 use crate::primitives::profile_table::ProfileTable;
@@ -419,7 +419,8 @@ fn waves(view: &View, profile: &[Profile; 3], radius: [f64; 3]) -> Vec<Wave> {
     for k in -2..=2 {
         for j in -2..=2 {
             for i in -2..=2 {
-                // Of a wave and the opposite one, the first that is not zero is positive.
+                // One of each pair of opposite waves: its first component that is not zero is
+                // positive.
                 if [k, j, i].into_iter().find(|&n| n != 0).is_none_or(|n| n < 0) {
                     continue;
                 }

@@ -62,10 +62,10 @@ use slabcast_common::view::View;
 use std::sync::Arc;
 use walk::Walk;
 
-/// Tolerance of halving: two levels must agree to this on a panel, as a share of the opacity so far.
-/// Against a tolerance of 1e-11 pixels are then off by at most 7e-5/255 (mri256 with peer-opaque
-/// and peer-semi, 400 to 1024 pixels, both projections); ten times as much makes 3e-4/255 for two
-/// thirds of the kernel values, a tenth makes 4e-5/255 for twice as many.
+/// Tolerance of halving: two levels must agree to this on a panel, as a share of the opacity so
+/// far. Against a tolerance of 1e-11 pixels are then off by at most 7e-5/255 (mri256 with
+/// peer-opaque and peer-semi, 400 to 1024 pixels, both projections); ten times as much makes
+/// 3e-4/255 for two thirds of the kernel values, a tenth makes 4e-5/255 for twice as many.
 const TOLERANCE: f64 = 1e-7;
 
 /// One view of a scene in f64, as reference for rendered pixels. Any number of threads may ask for
@@ -177,8 +177,8 @@ impl Reference {
     }
 
     /// Returns the limit at pixel (x, y), counted from the top left: linear premultiplied RGBA.
-    /// Where values are classified after reconstruction it is [`FieldReference`]'s; sheets and
-    /// ideals of this reference are those of `before` all the same.
+    /// With classification after reconstruction, [`FieldReference`] computes it. Sheets and ideals
+    /// of this reference are for classification before reconstruction even then.
     pub fn pixel(&self, x: u32, y: u32) -> [f64; 4] {
         if let Some(field) = &self.field {
             return field.pixel(x, y);

@@ -103,7 +103,7 @@ pub(super) struct Walk<'a> {
     of: &'a Reference,
     ray: &'a Ray,
     looks: &'a Classifier,
-    /// How far along the eye's axes a voxel is of use.
+    /// Distance along each of the eye's axes within which a voxel contributes.
     of_use: [f64; 3],
     /// The index axis along which the ray crosses most voxels.
     axis: usize,

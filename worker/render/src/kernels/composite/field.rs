@@ -1,10 +1,10 @@
 //! Compositing of a field: what the ray between two planes adds to a pixel.
 //!
 //! A plane holds the field's value and its derivatives along the eye's axes. Between two planes the
-//! value is the cubic with both values and both derivatives along the ray (Hermite), the gradient is
-//! linear. The segment is cut into sub-steps; the transfer function is integrated over each as if
-//! the value were linear in it (pre-integration: K. Engel et al., 2001), light falls on its middle.
-//! docs/design/sharp.md has the alternatives and what each costs.
+//! value is the cubic with both values and both derivatives along the ray (Hermite), the gradient
+//! is linear. The segment is cut into sub-steps; the transfer function is integrated over each as
+//! if the value were linear in it (pre-integration: K. Engel et al., 2001), light falls on its
+//! middle. docs/design/sharp.md has the alternatives and what each costs.
 //!
 //! `FieldRule::close_pixel` is the plain version. `lanes` does the same operations in the same
 //! order on registers of x86, so that both give the same bytes.
@@ -34,17 +34,18 @@ use std::sync::OnceLock;
 const STEPS: [f32; 3] = [100.0, 8000.0, 2.0];
 
 /// The gradient per vox of level 0, as a share of the range of all values, that a surface must have
-/// for its normal to be its own: below it the normal turns towards the eye. Without it rounding noise
-/// would light flat tissue.
+/// for its normal to be its own: below it the normal turns towards the eye. Without it rounding
+/// noise would light flat tissue.
 pub const FLAT_GRADIENT: f64 = 1.0 / 1020.0;
 
-/// Amplitude times cycles per lattice step below which a wave of the sum of weights is left out. Its
-/// slope is then at most a fiftieth of a code per step where values are 100 codes from the background.
+/// Amplitude times cycles per lattice step below which a wave of the sum of weights is left out.
+/// Its slope is then at most a fiftieth of a code per step where values are 100 codes from the
+/// background.
 const FAINT_WAVE: f64 = 3e-5;
 
 /// Most cycles per step, along each index axis, of a wave that is divided out. Seen from 30 degrees
-/// aside, waves of (3, 2) and (4, 2) cycles have slopes of 0.2 and 0.1 codes per step where values are
-/// 110 codes from the background: as much as [`FLAT_GRADIENT`] of an 8-bit volume.
+/// aside, waves of (3, 2) and (4, 2) cycles have slopes of 0.2 and 0.1 codes per step where values
+/// are 110 codes from the background: as much as [`FLAT_GRADIENT`] of an 8-bit volume.
 const WAVE_CYCLES: i32 = 5;
 
 /// Weight of the kernel inside the volume below which a value is not divided by it.
@@ -69,8 +70,8 @@ struct Faces {
     reach: f32,
 }
 
-/// One wave of the sum of all voxels' weights, which is 1 on average and repeats from voxel to voxel:
-/// `2 a cos(2 pi phase)`.
+/// One wave of the sum of all voxels' weights, which is 1 on average and repeats from voxel to
+/// voxel: `2 a cos(2 pi phase)`.
 #[derive(Clone, Copy, Debug)]
 struct Wave {
     /// The phase in cycles: `along . eye + from`.
@@ -166,7 +167,8 @@ pub struct FieldRule {
     /// Weights near the faces of each axis, made when a pixel first needs them.
     weights: OnceLock<[Box<[[f32; 2]]>; 3]>,
     profile: Profile,
-    /// Components along each index axis of unit steps along the kernel's three axes, in lattice steps.
+    /// Components along each index axis of unit steps along the kernel's three axes, in lattice
+    /// steps.
     across: [[f64; 3]; 3],
     /// Waves of the sum of weights.
     waves: Vec<Wave>,
@@ -397,7 +399,7 @@ impl FieldRule {
             outside |= (q < faces.lo) | (q > faces.hi);
             let [lo, lo_slope] = beside_face(table, q - faces.lo);
             let [hi, hi_slope] = beside_face(table, faces.hi - q);
-            // What lies beyond either face is missing: exact however thin the volume is.
+            // The weight beyond both faces is missing; this is exact however thin the volume is.
             let weight = (lo - (1.0 - hi)).max(LEAST_WEIGHT);
             let slope = (lo_slope - hi_slope) / weight;
             plane.value /= weight;
@@ -437,8 +439,8 @@ impl FieldRule {
         self.clip(ray, z)
     }
 
-    /// Cuts the segment that begins at depth `z` at the faces of the volume and of the cropping box:
-    /// shares of it.
+    /// Cuts the segment that begins at depth `z` at the faces of the volume and of the cropping
+    /// box: shares of it.
     fn clip(&self, ray: &Ray, z: f32) -> [f32; 2] {
         let [mut from, mut to] = [0.0f32, 1.0f32];
         for faces in self.faces.iter().chain(&self.crop) {
@@ -493,8 +495,8 @@ impl FieldRule {
         }
     }
 
-    /// Returns the field at plane `k` of a pixel with these raw sums: its value as a sample code, and
-    /// the length of its gradient in codes per vox.
+    /// Returns the field at plane `k` of a pixel with these raw sums: its value as a sample code,
+    /// and the length of its gradient in codes per vox.
     pub(crate) fn field_at(
         &self,
         scene: &FieldScene,
@@ -517,7 +519,8 @@ impl FieldRule {
         f64::from(raw * self.cell[1]) / scene.cells_per_code()
     }
 
-    /// Composites the segment in front of plane `k` at lane `i` of a row ([`FieldRule::close_row`]).
+    /// Composites the segment in front of plane `k` at lane `i` of a row
+    /// ([`FieldRule::close_row`]).
     fn close_pixel(
         &self,
         (scene, shader): (&FieldScene, Option<&Shader>),
@@ -544,7 +547,8 @@ impl FieldRule {
         if (high <= scene.visible[0]) | (low >= scene.visible[1]) | (to <= from) {
             return;
         }
-        // How many sub-steps: by the light, and by how far value and gradient change.
+        // The number of sub-steps follows from the light, and from the change of value and
+        // gradient.
         let most = h * scene.most[scene.cell(high).0 + 1];
         let share = (1.0 - row.a[i]) * if most < 1.0 { most } else { 1.0 };
         let flat = self.flat * self.flat;
@@ -628,8 +632,8 @@ impl FieldRule {
     }
 }
 
-/// A power of two by which codes are multiplied before the background is taken away, so that neither
-/// overflows nor vanishes in 32 bits: 1 but for values beyond 2^60 or below 2^-60.
+/// A power of two by which codes are multiplied before the background is taken away, so that
+/// neither overflows nor vanishes in 32 bits: 1 but for values beyond 2^60 or below 2^-60.
 fn shrink(scene: &FieldScene) -> f64 {
     let [lo, hi] = scene.range.map(f64::abs);
     let power = libm::ilogb(lo.max(hi).max(scene.span));
@@ -645,9 +649,9 @@ fn beside_face(table: &[[f32; 2]], distance: f32) -> [f32; 2] {
     [a[0] + (b[0] - a[0]) * t, a[1] + (b[1] - a[1]) * t]
 }
 
-/// Weights of a kernel inside the volume by the distance from a face, in steps of 1 / [`FACE_STEPS`]
-/// from the face on, and their slopes per lattice step. `across` holds the components along the
-/// face's normal of unit steps along the kernel's axes, in lattice steps.
+/// Weights of a kernel inside the volume by the distance from a face, in steps of 1 /
+/// [`FACE_STEPS`] from the face on, and their slopes per lattice step. `across` holds the
+/// components along the face's normal of unit steps along the kernel's axes, in lattice steps.
 ///
 /// Across a face the kernel has the profile that its three profiles, scaled by `across`, make when
 /// they are convolved. The weight is that profile's sum over the planes of samples inside, as a

@@ -187,8 +187,8 @@ impl Rule {
         *a += transmittance * sheet_a;
     }
 
-    /// How the colour changes through a sheet with sum `h` between one of `tl` before it and one of
-    /// `tn` behind, of any size. Ratios before squares: sums reach 1e15.
+    /// Returns the slopes of the colour through a sheet with sum `h`, between a sheet with sum `tl`
+    /// before it and one with `tn` behind. Ratios are taken before squares, since sums reach 1e15.
     #[inline(always)]
     fn slopes(&self, tl: f32, h: f32, tn: f32) -> Slopes {
         let ml = 1.0 / tl.max(h);
@@ -342,7 +342,7 @@ impl Rule {
             let weight = select(taus[i] < PHI_SERIES_BELOW, small, large);
             weights[i] = select(taus[i] > 0.0, weight, 0.0);
         }
-        // Where there is nothing, colours are nothing too, and neighbours may be anything.
+        // An empty pixel has no colour, whatever its neighbours hold.
         let mut slopes = [[0.0f32; LANES]; 4];
         if LINEAR {
             for i in 0..LANES {

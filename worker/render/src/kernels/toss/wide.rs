@@ -15,7 +15,8 @@ use slabcast_common::shade::NO_NORMAL;
 use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
 use slabcast_common::volume::Samples;
 
-/// Compiles [`Sieve::sift`] for an instruction set. All functions that it calls are inlined into it.
+/// Compiles [`Sieve::sift`] for an instruction set. All functions that it calls are inlined into
+/// it.
 macro_rules! compiled {
     ($name:ident, $features:literal, $lanes:ty) => {
         #[target_feature(enable = $features)]
@@ -89,7 +90,7 @@ unsafe fn make_ready<L: Lanes>(
 ) {
     let Tossing { at: [x, y, z], cells, samples, normals, ready, .. } = tossing;
     for i in (0..kept).step_by(L::LANES) {
-        // Of 512 each, as many begin here.
+        // Each array has 512 entries, of which a whole vector lies from `i` on.
         let ready = &mut ready[i..i + L::LANES];
         // SAFETY: as the line above shows; a voxel that is ready is four numbers.
         unsafe {

@@ -21,8 +21,8 @@ pub(super) struct Blocks {
 }
 
 impl Blocks {
-    /// Blocks of `codes`, the voxels of a lattice of `dims` (NaN where there is none), whose kernels
-    /// reach as far as `reach` along the axes of the lattice.
+    /// Blocks of `codes`, the voxels of a lattice of `dims` (NaN where there is none), whose
+    /// kernels reach as far as `reach` along the axes of the lattice.
     pub(super) fn new(
         dims: [u32; 3],
         codes: &[f32],
@@ -88,7 +88,7 @@ impl Blocks {
         if from >= to {
             return;
         }
-        // Where the box begins a corner may be rounded out of it.
+        // At the start of the box, rounding may move a corner out of it.
         let edge = EDGE as f64;
         let mut block: [usize; 3] = std::array::from_fn(|a| {
             let index = at[a] + step[a] * from;

@@ -51,8 +51,8 @@ pub(super) struct Looks {
     bends: Vec<f64>,
     /// `runs[l][i]`: the `2^l` bends from `i` on.
     runs: Vec<Vec<Bends>>,
-    /// How far from a bend its two sides are looked at, in codes; more than the rounding of its
-    /// code.
+    /// Distance from a bend at which its two sides are evaluated, in codes; more than the rounding
+    /// of its code.
     beside: f64,
 }
 
@@ -154,7 +154,7 @@ pub(super) struct Lamp {
     to_light: Option<DVec3>,
     /// Share of diffuse light from the eye.
     fill: f64,
-    /// How much of the direction to the eye is added to a gradient, in codes per vox.
+    /// Length of the vector to the eye that is added to a gradient, in codes per vox.
     to_face: f64,
 }
 

@@ -25,16 +25,16 @@
 //! seen.
 //!
 //! *Light.* With e the direction to the eye and g the gradient (eye axes, codes per vox), the
-//! normal is that of `side g + e range / 1020`, per vox of level 0, where `side` is the sign of g.e. So a surface is
-//! lit from both sides, and tissue too flat to have a side faces the eye instead of sparkling. The
-//! formula is ambient, Lambert and Blinn-Phong.
+//! normal is that of `side g + e range / 1020`, per vox of level 0, where `side` is the sign of
+//! g.e. So a surface is lit from both sides, and tissue too flat to have a side faces the eye
+//! instead of sparkling. The formula is ambient, Lambert and Blinn-Phong.
 //!
 //! Voxels that are NaN are left out of both sums, and so are those that no brick holds. Infinities
 //! count as the nearest finite code. Where no kernel reaches there is nothing.
 //!
-//! *Opacity by gradient.* Extinction is multiplied by the factor of `gradient_opacity` at the gradient's
-//! magnitude. Halving a panel finds the points of that function; it may miss a jump between two points
-//! at one magnitude.
+//! *Opacity by gradient.* Extinction is multiplied by the factor of `gradient_opacity` at the
+//! gradient's magnitude. Halving a panel finds the points of that function; it may miss a jump
+//! between two points at one magnitude.
 //!
 //! All voxels are kept in one array of 4 bytes each (codes are of 8 or 16 bits or f32, so
 //! f32 has them exactly), 64 MiB for 256^3: too much for the largest volumes.
@@ -60,8 +60,8 @@ use slabcast_common::view::{NEAR, Projection, View};
 use std::sync::Arc;
 use sums::{Line, Near};
 
-/// Tolerance of halving: two levels must agree to this on a panel, as a share of the opacity so far.
-/// Against 1e-8 pixels are then off by 1e-4 to 5e-4/255 (RMSE; at most 0.005), 200 pixels of
+/// Tolerance of halving: two levels must agree to this on a panel, as a share of the opacity so
+/// far. Against 1e-8 pixels are then off by 1e-4 to 5e-4/255 (RMSE; at most 0.005), 200 pixels of
 /// mri256 and aneurism. Ten times as much makes 1e-3/255 more (at most 0.008) for half the time;
 /// 1e-8 takes 3 to 7 times as long.
 const TOLERANCE: f64 = 1e-6;
@@ -315,7 +315,7 @@ impl FieldReference {
         }
         let [unseen, jump] = self.hidden(&parts, h * of.secant);
         off = off.max(jump * JUMP);
-        // Where nearly nothing was seen yet, a share of it would be less than any picture needs.
+        // While nearly nothing is visible, a share of it would be less than any picture needs.
         let opacity = -libm::expm1(-(sum.depth + depth));
         let one_vox = -libm::expm1(-self.looks.sigma_max.min(1.0));
         let agree = open * off <= self.tolerance * opacity.max(FAINT * one_vox)
@@ -333,8 +333,8 @@ impl FieldReference {
         }
     }
 
-    /// How much opacity or light a panel of `length` vox can hide because f passes a bend of the
-    /// transfer function: where it looks there as at no node, and where it jumps.
+    /// Returns bounds on the opacity or light that a panel of `length` vox can hide because f
+    /// passes a bend of the transfer function: by a look that no node has, and by a jump.
     fn hidden(&self, parts: &[Part; 2], length: f64) -> [f64; 2] {
         let (n, nodes) = (8, [&parts[0].nodes, &parts[1].nodes]);
         let node = |i: usize| &nodes[i / 4][i % 4];

@@ -25,8 +25,8 @@ pub(super) struct Near {
     /// Own coordinates of the line at z = 0 less the voxel's.
     at: DVec3,
     pub(super) code: f64,
-    /// Of parallel lines the product of the two profiles across, which is the same all along, and
-    /// its two derivatives.
+    /// Product of the two profiles across the line, and its two derivatives. Only parallel lines
+    /// use it: it is constant along them.
     across: [f64; 3],
 }
 
@@ -113,9 +113,8 @@ impl FieldReference {
         if all > 0.0 { base + sum / all } else { f64::NAN }
     }
 
-    /// The field, and its gradient in eye axes per vox, at depth `z` of a line.
-    ///
-    /// Of `sum w v / sum w` the derivative is `(sum w' v - f sum w') / sum w`.
+    /// Returns the field `f = sum w v / sum w` at depth `z` of a line, and its gradient in eye axes
+    /// per vox. The derivative of f is `(sum w' v - f sum w') / sum w`.
     #[inline]
     pub(super) fn with_gradient(&self, near: &[Near], line: &Line, z: f64) -> (f64, DVec3) {
         let kernel = &self.kernel;

@@ -289,8 +289,8 @@ unsafe fn smooth<L: Floats>(
     }
 }
 
-/// Returns a bit for each lane whose plane at depth `z` (vox) is near a face of the volume or outside
-/// the cropping box.
+/// Returns a bit for each lane whose plane at depth `z` (vox) is near a face of the volume or
+/// outside the cropping box.
 #[inline(always)]
 unsafe fn near<L: Floats>(rule: &FieldRule, rays: &Rays<L::Floats>, z: f32) -> u32 {
     // SAFETY: the caller has these instructions.
@@ -493,7 +493,7 @@ unsafe fn close<L: Floats>(
             return 0;
         }
 
-        // How many sub-steps each takes.
+        // Number of sub-steps of each lane.
         let (ends, _) = cell::<L>(high);
         let top = L::look_up(L::marks(visible), scene.most.as_ptr().add(1).cast(), ends);
         let top = L::least(L::mul(L::all(h), L::from_bits(top)), one);

@@ -57,16 +57,16 @@ impl GradientShares {
     }
 }
 
-/// How far below the smallest code the background lies where the smallest and the largest are visible,
-/// in shares of all codes. It costs sums this share of their precision; a constant volume needs more
-/// than nothing.
+/// Distance of the background below the smallest code, as a share of all codes, if both the
+/// smallest and the largest code are visible. It costs sums this share of their precision; a
+/// constant volume needs more than nothing.
 const BELOW: f64 = 1.0 / 64.0;
 
 /// Values of a scene: how codes become sums, and what values look like.
 #[derive(Debug)]
 pub struct FieldScene {
-    /// Code of which a sheet holds nothing: the smallest code of the volume or the largest, whichever is
-    /// invisible; below the smallest if both are visible.
+    /// Code of an empty sheet: the volume's smallest code or its largest, whichever is invisible.
+    /// If both are visible, it lies below the smallest.
     pub(super) background: f64,
     /// Samples along each index axis.
     pub(super) dims: [u32; 3],
@@ -76,8 +76,8 @@ pub struct FieldScene {
     pub(super) crop: Vec<CropFaces>,
     /// Smallest and largest code.
     pub(super) range: [f64; 2],
-    /// Smallest and largest number that bricks hold: codes, or coefficients of an interpolating kernel,
-    /// which are cut off at all codes' length beyond them.
+    /// Smallest and largest number that bricks hold: codes, or coefficients of an interpolating
+    /// kernel, which are cut off at all codes' length beyond them.
     pub(super) ends: [f64; 2],
     /// Codes from the smallest to the largest; of a constant volume a length that is not zero.
     pub(super) span: f64,
@@ -110,7 +110,8 @@ impl FieldScene {
             Some((lo, _)) if *lo == f64::NEG_INFINITY => summary.max_code,
             _ => summary.min_code,
         };
-        // A sheet without a value gets nothing, so samples that equal the background must be invisible.
+        // A sheet without a value gets nothing, so samples that equal the background must be
+        // invisible.
         let background = match classifier.optics_at(end)[0] > 0.0 {
             true => summary.min_code - span(summary) * BELOW,
             false => end,
@@ -210,7 +211,7 @@ fn hull(classifier: &Classifier, summary: &ValueSummary, ends: [f64; 2]) -> [f64
     // The transfer function is linear between codes: of whole codes it begins to show within one.
     let beside = if summary.kind == SampleKind::F32 { 0.0 } else { 1.0 };
     let clamp = |code: f64| code.clamp(summary.min_code, summary.max_code);
-    // What is beyond a visible end looks like it.
+    // Values beyond a visible end look like the end.
     let lo = if lo <= summary.min_code { ends[0] } else { clamp(lo - beside) };
     let hi = if hi >= summary.max_code { ends[1] } else { clamp(hi + beside) };
     if hi > lo { [lo, hi] } else { [lo, lo + span(summary)] }

@@ -18,7 +18,7 @@
 use std::path::Path;
 
 /// Memory limit of the parsing process. A slice of 16384 x 16384 pixels of 16 bits (512 MiB) is
-/// refused; one of 8192 x 8192 passes, compressed or not.
+/// refused; one of 8192 x 8192 passes, compressed or not, and one of 5000 x 5000 in JPEG 2000.
 pub(super) const MEMORY_BYTES: u64 = 512 << 20;
 
 /// Processor time limit of the parsing process: 16384 slices of 512 x 512 take some 10 s.

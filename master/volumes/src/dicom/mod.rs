@@ -11,6 +11,7 @@ mod fragments;
 mod frames;
 mod gaps;
 mod jpeg;
+mod jpeg2000;
 mod jpeg_ls;
 mod rle;
 mod series;
@@ -22,6 +23,8 @@ pub(crate) use elements::sniff;
 pub(crate) use frames::tests::enhanced;
 #[cfg(test)]
 pub(crate) use jpeg_ls::tests::{encoded_pictures, one_jpeg_ls};
+#[cfg(test)]
+pub(crate) use jpeg2000::tests::{ENCODED as JPEG_2000, one_jpeg_2000};
 #[cfg(test)]
 pub(crate) use series::one_slice;
 

@@ -15,6 +15,7 @@ pictures. Exits with 1 if a file differs.
 import importlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -349,7 +350,7 @@ def pydicom():
 
 def pydicom_jpeg_2000(pydicom_module, d):
     """Series that OpenJPEG encodes by way of pydicom, and pydicom's own files: each to the bit, with loss
-    within 2."""
+    within 4, of 65,536 at most."""
     from pydicom.pixels import pixel_array
     from pydicom.uid import ExplicitVRLittleEndian, JPEG2000, JPEG2000Lossless, generate_uid
     shape = (45, 37, 3)
@@ -383,10 +384,15 @@ def pydicom_jpeg_2000(pydicom_module, d):
                 if how == JPEG2000Lossless:
                     check("pydicom, JPEG 2000", folder, want)
                 else:
-                    near("pydicom, JPEG 2000 with loss", folder, want, 2)
+                    near("pydicom, JPEG 2000 with loss", folder, want, 4)
     for name, most in (("JPEG2000.dcm", 2), ("693_J2KI.dcm", 2), ("J2K_pixelrep_mismatch.dcm", 0)):
         path = pydicom_module.data.get_testdata_file(name)
-        near("pydicom's JPEG 2000 files", path, pixel_array(path).T[:, :, None], most)
+        # Alone: a damaged twin of one lies beside it.
+        os.makedirs(f"own_{name}", exist_ok=True)
+        shutil.copy(path, f"own_{name}/1.dcm")
+        header = pydicom_module.dcmread(path)
+        want = pixel_array(path) * float(header.get("RescaleSlope", 1)) + float(header.get("RescaleIntercept", 0))
+        near("pydicom's JPEG 2000 files", f"own_{name}", want.T[:, :, None], most)
 
 
 def vtk():

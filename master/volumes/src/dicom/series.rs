@@ -3,8 +3,8 @@
 
 use super::elements::{File, Packing, Pixels, Tag};
 use super::gaps::{millimetres, missing_after, missing_note};
-use super::wire::Preface;
 use super::{fragments, frames, jpeg, jpeg_ls, jpeg2000, rle};
+use crate::confined::wire::Preface;
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::pick::{Axis, Kind, Pick};
 use crate::samples::{DIM_MAX, Endian, Layout, Number};

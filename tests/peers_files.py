@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Writes small volumes with the peers' own writers, and compares what slabcast reads.
 
-    python3 -m venv venv && venv/bin/pip install nibabel SimpleITK pynrrd tifffile imagecodecs zarr pydicom vtk
+    python3 -m venv venv && venv/bin/pip install nibabel SimpleITK pynrrd tifffile imagecodecs zarr pydicom vtk \
+        pylibjpeg pylibjpeg-openjpeg
     venv/bin/python tests/peers_files.py target/debug/slabcast
 
 Each file holds 7x5x3 numbers of one type. `slabcast convert` writes it as raw NRRD, whose samples must
@@ -14,6 +15,7 @@ pictures. Exits with 1 if a file differs.
 import importlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -74,6 +76,21 @@ def check(writer, path, want, *flags, steps=None, origin=None):
     row[0 if same else 1] += 1
     if not same:
         print(f"DIFFERS: {name}: {got.dtype} {got.ravel('F')[:3]}, want {want.ravel('F')[:3]}")
+
+
+def near(writer, path, want, most):
+    """Checks that samples differ from those of a codec with loss by `most` at most."""
+    row = counts.setdefault(writer, [0, 0, 0])
+    said = run("convert", path, "out.nrrd", "--encoding", "raw", "--force")
+    if said.returncode:
+        row[2] += 1
+        print(f"refused: {writer} {path}: {said.stderr.strip()[:200]}")
+        return
+    got = samples("out.nrrd")
+    far = np.abs(got.astype("f8") - want.astype("f8")).max() if got.shape == want.shape else np.inf
+    row[0 if far <= most else 1] += 1
+    if far > most:
+        print(f"DIFFERS: {writer} {path}: by {far}, {got.shape}, {want.shape}")
 
 
 def refuse(writer, path, say):
@@ -312,6 +329,8 @@ def pydicom():
                   steps=[[-0.75, 0, 0], [0, -1.25, 0], [0, 0, 2.5]], origin=[-31.5, 12.25, 0])
 
 
+    pydicom_jpeg_2000(pydicom_module, d)
+
     # One of eight slices is missing.
     a = np.asfortranarray(np.random.default_rng(3).integers(0, 4000, (7, 5, 8)).astype("i2"))
     d = pydicom_module.dcmread("dicom_i2/00.dcm")
@@ -327,6 +346,53 @@ def pydicom():
           origin=[-31.5, 12.25, 0])
     colours = pydicom_module.data.get_testdata_file("SC_rgb_jpeg.dcm")
     refuse("pydicom, colours", colours, "a picture in colours (`RGB`)")
+
+
+def pydicom_jpeg_2000(pydicom_module, d):
+    """Series that OpenJPEG encodes by way of pydicom, and pydicom's own files: each to the bit, with loss
+    within 4, of 65,536 at most."""
+    from pydicom.pixels import pixel_array
+    from pydicom.uid import ExplicitVRLittleEndian, JPEG2000, JPEG2000Lossless, generate_uid
+    shape = (45, 37, 3)
+    for bits in (8, 10, 12, 16):
+        for signed in (0, 1):
+            low = -(1 << bits - 1) if signed else 0
+            kind = "iu"[1 - signed] + ("1" if bits == 8 else "2")
+            a = np.random.default_rng(bits).integers(low, low + (1 << bits), shape)
+            a[:, :20] = np.add.outer(np.arange(45), 3 * np.arange(20))[..., None] % (1 << bits) + low
+            a = np.asfortranarray(a.astype(kind))
+            for how in (JPEG2000Lossless, JPEG2000):
+                folder = f"j2k_{bits}_{signed}_{'lossy' if how == JPEG2000 else 'exact'}"
+                os.makedirs(folder, exist_ok=True)
+                series, want = generate_uid(), a.copy(order="F")
+                for k in range(3):
+                    s = pydicom_module.Dataset(d)
+                    s.preamble, s.file_meta = b"\0" * 128, pydicom_module.dataset.FileMetaDataset(d.file_meta)
+                    s.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+                    s.SeriesInstanceUID, s.InstanceNumber = series, k + 1
+                    s.SOPInstanceUID = s.file_meta.MediaStorageSOPInstanceUID = generate_uid()
+                    s.ImagePositionPatient = [31.5, -12.25, 2.5 * k]
+                    s.Rows, s.Columns = shape[1], shape[0]
+                    s.BitsStored, s.HighBit, s.PixelRepresentation = bits, bits - 1, signed
+                    s.BitsAllocated = 8 * a.dtype.itemsize
+                    s.PixelData = np.ascontiguousarray(a[:, :, k].T).tobytes()
+                    s.PixelData += b"\0" * (len(s.PixelData) % 2)
+                    s["PixelData"].VR = "OW"
+                    s.compress(how, generate_instance_uid=False, **({} if how == JPEG2000Lossless else {"j2k_cr": [4]}))
+                    s.save_as(f"{folder}/{k}.dcm", enforce_file_format=True)
+                    want[:, :, k] = pixel_array(f"{folder}/{k}.dcm").T
+                if how == JPEG2000Lossless:
+                    check("pydicom, JPEG 2000", folder, want)
+                else:
+                    near("pydicom, JPEG 2000 with loss", folder, want, 4)
+    for name, most in (("JPEG2000.dcm", 2), ("693_J2KI.dcm", 2), ("J2K_pixelrep_mismatch.dcm", 0)):
+        path = pydicom_module.data.get_testdata_file(name)
+        # Alone: a damaged twin of one lies beside it.
+        os.makedirs(f"own_{name}", exist_ok=True)
+        shutil.copy(path, f"own_{name}/1.dcm")
+        header = pydicom_module.dcmread(path)
+        want = pixel_array(path) * float(header.get("RescaleSlope", 1)) + float(header.get("RescaleIntercept", 0))
+        near("pydicom's JPEG 2000 files", f"own_{name}", want.T[:, :, None], most)
 
 
 def vtk():

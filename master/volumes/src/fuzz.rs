@@ -643,6 +643,18 @@ fn jpeg_ls_mutants_neither_panic_nor_hang_nor_fill_memory() {
     );
 }
 
+#[cfg(feature = "dicom")]
+#[test]
+fn jpeg_2000_mutants_neither_panic_nor_hang_nor_fill_memory() {
+    let seeds = crate::dicom::JPEG_2000.map(|(_, _, file)| file.to_vec());
+    survive(
+        "jpeg-2000",
+        mutants(),
+        |rng| seed_or_mutant(rng, &seeds),
+        |bytes| crate::dicom::one_jpeg_2000(&bytes).map(|_| None),
+    );
+}
+
 /// Runs a tenth of the number of mutants, since each writes files first.
 #[cfg(feature = "zarr")]
 #[test]

@@ -47,6 +47,8 @@
 pub mod auto_level;
 pub mod blocks;
 mod colours;
+#[cfg(any(feature = "dicom", feature = "hdf5"))]
+mod confined;
 mod data;
 #[cfg(feature = "dicom")]
 pub mod dicom;

@@ -84,6 +84,7 @@ pub(super) enum Packing {
     Rle,
     Jpeg,
     JpegLs,
+    Jpeg2000,
 }
 
 /// A file read up to its pixels.
@@ -160,10 +161,14 @@ impl File {
                 "1.2.840.10008.1.2.4.80" | "1.2.840.10008.1.2.4.81" => {
                     (meta, Some(Packing::JpegLs), false)
                 }
+                "1.2.840.10008.1.2.4.90" | "1.2.840.10008.1.2.4.91" => {
+                    (meta, Some(Packing::Jpeg2000), false)
+                }
                 other => {
                     let name = match other.strip_prefix("1.2.840.10008.1.2.4.") {
                         Some("52" | "53" | "54" | "55" | "56") => "JPEG of a kind that is not used",
-                        Some("90" | "91" | "92" | "93" | "201" | "202" | "203") => "JPEG 2000",
+                        Some("92" | "93") => "JPEG 2000 of several components",
+                        Some("201" | "202" | "203") => "JPEG 2000 of high throughput",
                         Some("100" | "101" | "102" | "103" | "104" | "105" | "106") => "video",
                         _ => "not an encoding that is known",
                     };

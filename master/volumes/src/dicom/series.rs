@@ -3,8 +3,8 @@
 
 use super::elements::{File, Packing, Pixels, Tag};
 use super::gaps::{millimetres, missing_after, missing_note};
-use super::wire::Preface;
-use super::{fragments, frames, jpeg, jpeg_ls, rle};
+use super::{fragments, frames, jpeg, jpeg_ls, jpeg2000, rle};
+use crate::confined::wire::Preface;
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::pick::{Axis, Kind, Pick};
 use crate::samples::{DIM_MAX, Endian, Layout, Number};
@@ -691,6 +691,7 @@ fn pixels_of(slice: &Slice, mut file: File, len: u64, number: Number) -> Result<
             let sizes = (format.columns, format.rows);
             match packing {
                 Packing::JpegLs => jpeg_ls::unpack(&fragment, sizes, size)?,
+                Packing::Jpeg2000 => jpeg2000::unpack(fragment, sizes, size, format.signed)?,
                 _ => jpeg::unpack(&fragment, sizes, size)?,
             }
         }

@@ -7,18 +7,18 @@ use glam::DVec3;
 use slabcast_common::volume::Lattice;
 use std::io::{self, BufRead, Read, Write};
 
-/// Description of a series, sent before its samples.
+/// Description of a volume, sent before its samples.
 #[derive(Debug, PartialEq)]
-pub(super) struct Preface {
-    pub(super) name: String,
-    pub(super) number: Number,
-    pub(super) lattice: Lattice,
-    pub(super) anatomical: bool,
+pub(crate) struct Preface {
+    pub(crate) name: String,
+    pub(crate) number: Number,
+    pub(crate) lattice: Lattice,
+    pub(crate) anatomical: bool,
     /// Slope and intercept from stored numbers to values.
-    pub(super) rescale: [f64; 2],
+    pub(crate) rescale: [f64; 2],
     /// Whether the samples are rescaled already, to f32.
-    pub(super) float: bool,
-    pub(super) notes: Vec<String>,
+    pub(crate) float: bool,
+    pub(crate) notes: Vec<String>,
 }
 
 /// Most bytes of a preface or problem.
@@ -34,15 +34,17 @@ const KINDS: [(OpenErrorKind, &str); 7] = [
     (OpenErrorKind::Damaged, "damaged"),
 ];
 
-const NUMBERS: [Number; 8] = [
+const NUMBERS: [Number; 10] = [
     Number::U8,
     Number::I8,
     Number::U16,
     Number::I16,
     Number::U32,
     Number::I32,
+    Number::U64,
     Number::I64,
     Number::F32,
+    Number::F64,
 ];
 
 /// Replaces control characters, so that the text is one line.
@@ -51,7 +53,7 @@ fn one_line(text: &str) -> String {
 }
 
 /// Writes a problem instead of a preface.
-pub(super) fn write_problem(p: &Problem, out: &mut dyn Write) -> io::Result<()> {
+pub(crate) fn write_problem(p: &Problem, out: &mut dyn Write) -> io::Result<()> {
     let kind = KINDS.iter().find(|(kind, _)| *kind == p.kind).map_or("damaged", |(_, word)| word);
     let (field, what, remedy) = (one_line(&p.field), one_line(&p.what), one_line(&p.remedy));
     write!(out, "problem {kind}\n{field}\n{what}\n{remedy}\n\n")?;
@@ -59,7 +61,7 @@ pub(super) fn write_problem(p: &Problem, out: &mut dyn Write) -> io::Result<()> 
 }
 
 impl Preface {
-    pub(super) fn write(&self, out: &mut dyn Write) -> io::Result<()> {
+    pub(crate) fn write(&self, out: &mut dyn Write) -> io::Result<()> {
         let l = &self.lattice;
         let numbers = l.steps.iter().chain([&l.origin]).flat_map(|v| v.to_array());
         let numbers = numbers.chain(self.rescale).map(|x| format!("{x:?}")).collect::<Vec<_>>();
@@ -81,7 +83,7 @@ impl Preface {
 
     /// Reads the output of [`Preface::write`] or [`write_problem`]. `None` if it is missing or
     /// malformed: the process has failed.
-    pub(super) fn read(from: &mut dyn BufRead) -> Option<Result<Preface, Problem>> {
+    pub(crate) fn read(from: &mut dyn BufRead) -> Option<Result<Preface, Problem>> {
         let mut lines = Vec::new();
         let mut from = from.take(PREFACE_MAX_BYTES);
         loop {

@@ -1,7 +1,7 @@
 //! Takes from the parsing process what parsing does not need, for good.
 //!
 //! A parser that was taken over should find nothing to take. What it can still do: read the files
-//! of the opened folder, compute for [`CPU_SECS`] in [`MEMORY_BYTES`], write to its two pipes, and
+//! of the opened folder (or the one file), compute for [`CPU_SECS`] in [`MEMORY_BYTES`], write to its two pipes, and
 //! look at the names of that folder. The program that reads the pipe believes none of it
 //! ([`super::wire`]).
 //!
@@ -18,7 +18,7 @@
 use std::path::Path;
 
 /// Memory limit of the parsing process. A slice of 16384 x 16384 pixels of 16 bits (512 MiB) is
-/// refused; one of 8192 x 8192 passes, compressed or not.
+/// refused; one of 8192 x 8192 passes, compressed or not, and one of 5000 x 5000 in JPEG 2000.
 pub(super) const MEMORY_BYTES: u64 = 512 << 20;
 
 /// Processor time limit of the parsing process: 16384 slices of 512 x 512 take some 10 s.
@@ -28,8 +28,8 @@ pub(super) const CPU_SECS: u64 = 120;
 #[cfg(unix)]
 const OPEN_FILES: u64 = 32;
 
-/// Confines this process to parsing the files of a folder. Returns a sentence for each thing that
-/// the system did not allow to take away.
+/// Confines this process to parsing the files of a folder, or one file. Returns a half sentence for each
+/// thing that the system did not allow to take away.
 pub(super) fn confine(folder: &Path) -> Vec<String> {
     let mut lacks = Vec::new();
     #[cfg(unix)]
@@ -44,9 +44,6 @@ pub(super) fn confine(folder: &Path) -> Vec<String> {
         lacks.push("this system can't keep it from other files and the network".into());
     }
     lacks
-        .iter()
-        .map(|lack| format!("DICOM is parsed in a process of its own, but {lack}"))
-        .collect()
 }
 
 /// Sets the limits that every Unix has; false if one was refused.

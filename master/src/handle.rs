@@ -6,7 +6,7 @@ use crate::finishers::Finishers;
 use crate::hooks::{Hooks, Stage};
 use crate::jobs::submit::{Plan, SubmitError, check_key};
 use crate::jobs::{JobView, Jobs, Watch};
-use crate::library::{Library, Viewer};
+use crate::library::{Library, Viewer, VolumeError};
 use crate::link::{Caller, WorkerLink};
 use crate::memory::Shares;
 use crate::panics::caught;
@@ -271,7 +271,11 @@ impl Handle {
             caught("checking the request", || {
                 hooks.reach(Stage::Plan);
                 let open = library.open(&request.volume, viewer)?;
-                Plan::new(request, &open, |level| library.level(&open, level), &shares)
+                let plan = Plan::new(request, &open, |level| library.level(&open, level), &shares);
+                if let Err(SubmitError::Volume(VolumeError::NotReadable(_))) = &plan {
+                    library.close(open.served.info.digest);
+                }
+                plan
             })
         });
         let plan = planned.await.ok_or(SubmitError::Gone)?;

@@ -35,6 +35,12 @@ impl Driver {
     ) {
         warn!(%worker, set = %set.0, reason, "bricks can't be read");
         self.bricks_did_not_leave(worker, set, bricks);
+        let mut jobs = self.active.ids().filter_map(|id| self.active.get(id));
+        let volume = jobs.find(|job| job.scene.bricks == set).map(|job| job.scene.volume.digest);
+        drop(jobs);
+        if let Some(digest) = volume {
+            self.library.close(digest);
+        }
         self.brick_sets.forget(set);
         self.fail_jobs_of(set, reason);
     }

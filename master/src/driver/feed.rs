@@ -357,7 +357,10 @@ impl Driver {
                 let kept = shares.bricks_kept(&open);
                 let store =
                     BrickStore::cut(&open.source, open.level, &needs, before.as_deref(), kept);
-                store.map(Arc::new).map_err(|e| VolumeError::NotReadable(e.to_string()))
+                store.map(Arc::new).map_err(|e| {
+                    library.close(digest);
+                    VolumeError::NotReadable(e.to_string())
+                })
             });
             let store = store
                 .map_err(|panicked| panicked.to_string())

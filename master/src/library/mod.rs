@@ -402,6 +402,16 @@ impl Library {
         }
     }
 
+    /// Closes a volume of the folder, given by the digest of a level, since its file changed or can't be
+    /// read. The next request for it opens the file again.
+    pub fn close(&self, digest: Digest32) {
+        let mut entries = self.lock();
+        let of_folder = entries.by_name.values_mut().filter(|e| e.origin == VolumeOrigin::Folder);
+        for entry in of_folder.filter(|e| e.levels.contains(&digest)) {
+            entry.source = None;
+        }
+    }
+
     /// Returns the name of the entry that is meant.
     fn find(&self, choice: &VolumeChoice, viewer: Viewer) -> Result<String, VolumeError> {
         if let VolumeChoice::Digest(digest) = choice {

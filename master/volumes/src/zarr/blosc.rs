@@ -205,14 +205,27 @@ fn unshuffle_bits(plain: &[u8], size: usize, out: &mut Vec<u8>) {
     }
     let start = out.len();
     out.resize(start + n * size, 0);
-    let to = &mut out[start..];
-    for row in 0..8 * size {
-        for i in 0..n {
-            let bit = plain[row * (n / 8) + i / 8] >> (i % 8) & 1;
-            to[i * size + row / 8] |= bit << (row % 8);
+    let row = n / 8;
+    for (eight, to) in out[start..].chunks_exact_mut(8 * size).enumerate() {
+        for byte in 0..size {
+            let bits = std::array::from_fn(|bit| plain[(byte * 8 + bit) * row + eight]);
+            for (i, value) in transpose(u64::from_le_bytes(bits)).to_le_bytes().iter().enumerate() {
+                to[i * size + byte] = *value;
+            }
         }
     }
     out.extend(&plain[n * size..]);
+}
+
+/// Transposes 8 x 8 bits: bit i of byte j becomes bit j of byte i (Hacker's Delight, 7-3).
+fn transpose(bits: u64) -> u64 {
+    let swap = |x: u64, mask: u64, by: u32| {
+        let t = (x ^ (x >> by)) & mask;
+        x ^ t ^ (t << by)
+    };
+    let x = swap(bits, 0x00aa_00aa_00aa_00aa, 7);
+    let x = swap(x, 0x0000_cccc_0000_cccc, 14);
+    swap(x, 0x0000_0000_f0f0_f0f0, 28)
 }
 
 #[cfg(test)]

@@ -77,6 +77,20 @@ impl TightBox {
     }
 }
 
+/// Returns the ends of the box of the marked voxels of a brick, both included, of x, y, z. A word is
+/// a layer of 8 rows of 8 voxels; one voxel at least is marked.
+fn tight_ends(present: &[u64; BRICK_VOXELS / 64]) -> [[u8; 3]; 2] {
+    let layers = (0..).zip(present).fold(0u8, |all, (z, &word)| all | u8::from(word != 0) << z);
+    let plane = present.iter().fold(0, |all, word| all | word).to_le_bytes();
+    let rows = (0..).zip(plane).fold(0u8, |all, (y, row)| all | u8::from(row != 0) << y);
+    let columns = plane.iter().fold(0, |all, row| all | row);
+    let axes = [columns, rows, layers];
+    [
+        axes.map(|a| a.trailing_zeros().min(7) as u8),
+        axes.map(|a| 7u8.saturating_sub(a.leading_zeros() as u8)),
+    ]
+}
+
 /// Directory entry of a relevant brick: what the scheduler knows without its voxels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BrickInfo {
@@ -156,17 +170,11 @@ impl Brick {
         let n = index.len();
         assert_eq!(values.len(), n, "a value a voxel");
         assert!(normals.as_ref().is_none_or(|v| v.len() == n), "a normal a voxel");
-        let (mut lo, mut hi) = ([7u8; 3], [0u8; 3]);
         let mut present = [0u64; BRICK_VOXELS / 64];
         for &i in &index {
-            let i = i % BRICK_VOXELS as u16;
-            present[usize::from(i) / 64] |= 1 << (i % 64);
-            let p = local_position(i);
-            for a in 0..3 {
-                lo[a] = lo[a].min(p[a] as u8);
-                hi[a] = hi[a].max(p[a] as u8);
-            }
+            present[usize::from(i) % BRICK_VOXELS / 64] |= 1 << (i % 64);
         }
+        let [lo, hi] = tight_ends(&present);
         Brick { id, index, values, normals, gradients: None, tight: [lo, hi], present }
     }
 

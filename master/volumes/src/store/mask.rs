@@ -68,22 +68,17 @@ impl VoxelMask {
                 }
             }
         }
-        // Rows along y, then layers along z: each is the union of its neighbours.
-        for (n, stride) in [(self.size[1], 1), (self.size[2], self.size[1])] {
-            let from = &self.bits;
-            let mut to = vec![0u64; from.len()];
-            for (row, to) in to.chunks_mut(words).enumerate() {
-                let at = row / stride % n;
-                let (first, last) =
-                    (at.saturating_sub(steps as usize), (at + steps as usize).min(n - 1));
-                for other in first..=last {
-                    let other = (row + other * stride - at * stride) * words;
-                    for (to, from) in to.iter_mut().zip(&from[other..other + words]) {
-                        *to |= from;
-                    }
+        // Rows along y within their layer, then layers along z: each is the union of its neighbours.
+        for (n, stride) in [(self.size[1], words), (self.size[2], words * self.size[1])] {
+            let from = self.bits.clone();
+            for (to, from) in self.bits.chunks_mut(n * stride).zip(from.chunks(n * stride)) {
+                for far in (1..=(steps as usize).min(n - 1)).map(|step| step * stride) {
+                    let len = to.len() - far;
+                    let unite = |(to, from): (&mut u64, &u64)| *to |= from;
+                    to[far..].iter_mut().zip(&from[..len]).for_each(unite);
+                    to[..len].iter_mut().zip(&from[far..]).for_each(unite);
                 }
             }
-            self.bits = to;
         }
         self
     }

@@ -33,7 +33,7 @@ pub struct InputArgs {
     #[arg(long, value_name = "ORDER", value_parser = parse::byte_order, help_heading = HEADING,
           hide_short_help = true)]
     byte_order: Option<bool>,
-    /// Distances of samples of raw numbers, pictures or NumPy arrays, such as 0.5x0.5x1.25 [default: 1x1x1]
+    /// Distances of samples of raw numbers, pictures, NumPy arrays or HDF5, such as 0.5x0.5x1.25 [default: 1x1x1]
     #[arg(long, value_name = "AxBxC", value_parser = parse::spacing, help_heading = HEADING,
           hide_short_help = true)]
     spacing: Option<[f64; 3]>,
@@ -45,7 +45,8 @@ pub struct InputArgs {
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     series: Option<String>,
-    /// Which array of a file of several (.npz, .vti, .vtk): its name [default: the only one, or the first]
+    /// Which array of a file of several (.npz, .vti, .vtk, .h5, .hdf5, .ims): its name [default: the only one, the first, or
+    /// the largest]
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     dataset: Option<String>,
@@ -105,7 +106,8 @@ impl InputArgs {
             raw,
             series: self.series.clone(),
             dataset: self.dataset.clone(),
-            dicom_reader: dicom_reader(),
+            dicom_reader: reader("read-dicom"),
+            hdf5_reader: reader("read-hdf5"),
             level: match self.level {
                 Some(LevelChoice::At(level)) => Some(level),
                 Some(LevelChoice::Auto) | None => None,
@@ -316,11 +318,11 @@ fn cache_folder() -> Option<PathBuf> {
     variable("SLABCAST_CACHE").or_else(|| variable("CACHE_DIRECTORY")).or_else(users)
 }
 
-/// This program as it parses DICOM for another of its processes (`slabcast read-dicom`). Where the
-/// system doesn't say which file we are, a thread has to do.
-fn dicom_reader() -> Option<Vec<OsString>> {
+/// This program as it parses a format for another of its processes, by a hidden command (`slabcast
+/// read-dicom`). Where the system doesn't say which file we are, a thread has to do.
+fn reader(command: &str) -> Option<Vec<OsString>> {
     let program = std::env::current_exe().ok()?;
-    Some(vec![program.into(), "read-dicom".into()])
+    Some(vec![program.into(), command.into()])
 }
 
 /// Opens a file, a folder or a `formula:` volume without any flags.

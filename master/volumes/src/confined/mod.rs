@@ -8,11 +8,11 @@ mod confine;
 mod watch;
 pub(crate) mod wire;
 
+use crate::Opened;
 use crate::error::{OpenErrorKind, Problem};
 use crate::limit::ByteCap;
 use crate::pick::Pick;
 use crate::samples::{self, Endian, Layout, Supply};
-use crate::Opened;
 use confine::{CPU_SECS, MEMORY_BYTES};
 use slabcast_common::volume::{ValueMap, Volume};
 use std::ffi::OsString;
@@ -134,8 +134,9 @@ impl Parser<'_> {
         preface: Preface,
         pipe: &mut (dyn Read + Send),
     ) -> Result<Opened, Problem> {
-        let Preface { name, number, lattice, anatomical, rescale: [slope, intercept], notes, .. } =
-            preface;
+        let Preface {
+            name, number, lattice, anatomical, rescale: [slope, intercept], notes, ..
+        } = preface;
         let layout =
             Layout::new(lattice.dims.map(u64::from), number, Endian::Little, self.samples)?;
         lattice.check().map_err(|e| Problem::malformed(self.samples, e, self.remedies[1]))?;

@@ -8,9 +8,8 @@ use hdf5_reader::{Attribute, Dataset, Datatype, Hdf5File, OpenOptions, Storage};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Most groups and datasets that are looked at, and the deepest level.
+/// Most groups and datasets that are looked at.
 const OBJECTS_MAX: usize = 4096;
-const DEPTH_MAX: usize = 16;
 /// Bytes of a chunk at most, of chunks that are kept for the next slices, and of a header.
 const CHUNK_MAX_BYTES: usize = 128 << 20;
 const KEPT_BYTES: usize = 64 << 20;
@@ -31,6 +30,12 @@ pub(super) fn problem(field: &str, error: &Error) -> Problem {
             field,
             format!("is packed by a filter that is not read ({text})"),
             "pack it by gzip: h5repack -f GZIP=1 IN OUT",
+        ),
+        Error::InvalidData(what) if what.contains("external raw data") => Problem::new(
+            OpenErrorKind::Forbidden,
+            field,
+            "keeps its numbers in another file, which is not opened",
+            "store them inside: h5repack -l CONTI IN OUT",
         ),
         Error::UnsupportedLayoutClass(3) => Problem::unsupported(
             field,
@@ -118,9 +123,9 @@ impl Tree {
     pub(super) fn datasets(&self) -> Result<Vec<(String, Dataset)>, Problem> {
         let root = self.file.root_group().map_err(|e| problem("content", &e))?;
         let (mut out, mut seen) = (Vec::new(), BTreeSet::from([root.address()]));
-        let mut open = vec![(root, String::new(), 0)];
+        let mut open = vec![(root, String::new())];
         let mut objects = 0;
-        while let Some((group, path, depth)) = open.pop() {
+        while let Some((group, path)) = open.pop() {
             let at = if path.is_empty() { "content".into() } else { quoted(&path) };
             let (mut groups, mut datasets) =
                 group.member_names().map_err(|e| match problem(&at, &e) {
@@ -155,12 +160,12 @@ impl Tree {
                     out.push((below(&name), dataset));
                 }
             }
-            for name in groups.iter().rev().filter(|_| depth < DEPTH_MAX) {
+            for name in groups.iter().rev() {
                 // A group may be reached by several links, also from inside itself.
                 if let Ok(child) = group.group(name)
                     && seen.insert(child.address())
                 {
-                    open.push((child, below(name), depth + 1));
+                    open.push((child, below(name)));
                 }
             }
         }

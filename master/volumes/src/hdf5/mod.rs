@@ -1,8 +1,8 @@
 //! Reader of HDF5: one dataset of numbers becomes a volume. Of four uses of the format it knows what
 //! the axes are: Imaris, MINC 2, NetCDF-4 and VTKHDF; of others, what ilastik and Fiji write.
 //!
-//! The crate `hdf5-reader` parses, in a process of its own ([`serve`], [`crate::confined`]): it is not
-//! hardened as our readers are. It parses types loosely, so [`number`] reads those itself.
+//! The crate `hdf5-reader` parses, in a process of its own ([`serve`], `confined`): it is not
+//! hardened as our readers are. It parses types loosely, so `number` reads those itself.
 
 mod axes;
 mod file;

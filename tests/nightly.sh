@@ -45,7 +45,7 @@ for name in "$@"; do
              }
              END { printf "%d mutants of %d parsers, %d opened", mutants, parsers, opened }' \
             env SLABCAST_MUTANTS="${SLABCAST_MUTANTS:-100000}" \
-            cargo test --release --locked -p slabcast-volumes mutants -- --nocapture
+            cargo test --release --locked -p slabcast-volumes --all-features mutants -- --nocapture
         ;;
     simd)
         campaign simd "$tests" \

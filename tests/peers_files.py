@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Writes small volumes with the peers' own writers, and compares what slabcast reads.
 
-    python3 -m venv venv && venv/bin/pip install nibabel SimpleITK pynrrd tifffile imagecodecs zarr pydicom vtk \
+    python3 -m venv venv && venv/bin/pip install nibabel SimpleITK pynrrd tifffile imagecodecs zarr pydicom vtk h5py netCDF4 \
         pylibjpeg pylibjpeg-openjpeg
     venv/bin/python tests/peers_files.py target/debug/slabcast
 
@@ -26,7 +26,7 @@ DIMS = (7, 5, 3)
 TYPES = ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"]
 NRRD = {"uint8": "u1", "int8": "i1", "uint16": "u2", "int16": "i2", "uint32": "u4", "int32": "i4",
         "uint64": "u8", "int64": "i8", "float": "f4", "double": "f8"}
-PEERS = ["numpy", "nibabel", "SimpleITK", "nrrd", "tifffile", "zarr", "pydicom", "vtk"]
+PEERS = ["h5py", "netCDF4", "numpy", "nibabel", "SimpleITK", "nrrd", "tifffile", "zarr", "pydicom", "vtk"]
 peer = {}
 counts = {}
 
@@ -436,6 +436,129 @@ def vtk():
             for dataset, want in (("values", a), ("other", other)):
                 check("VTK, one of two arrays", name, want, "--dataset", dataset,
                       steps=np.diag((0.7, 1.3, 2.9)), origin=(31.5, -12.25, 107.75))
+
+
+def h5py():
+    """Every type in every layout, index of chunks and filter; equality with what h5py reads back."""
+    h5 = peer["h5py"]
+    layouts = {
+        "contiguous": {}, "chunks": {"chunks": (2, 3, 4)},
+        "gzip": {"chunks": (2, 3, 4), "compression": "gzip"},
+        "shuffle": {"chunks": (1, 5, 7), "compression": "gzip", "shuffle": True, "fletcher32": True},
+        "grows": {"chunks": (1, 2, 3), "maxshape": (None, 5, 7), "compression": "gzip"},
+        "grows twice": {"chunks": (2, 2, 3), "maxshape": (None, None, 7)},
+        "one chunk": {"chunks": (3, 5, 7), "compression": "gzip"}, "szip": {"chunks": (2, 3, 4), "compression": "szip"},
+    }
+    for kind in TYPES + ["f2", "b1"]:
+        a = numbers("u1") % 2 == 1 if kind == "b1" else numbers("f4" if kind == "f2" else kind)
+        a = (a / 100 if kind == "f2" else a).astype(kind)
+        want = np.asfortranarray(a.astype({"f2": "f4", "b1": "u1"}.get(kind, kind)))
+        stored = np.ascontiguousarray(a.transpose(2, 1, 0))
+        for order in "<>":
+            for libver in ("earliest", "v108", "v110", "latest"):
+                with h5.File("a.h5", "w", libver=libver if libver in ("earliest", "latest") else (libver, libver)) as f:
+                    for name, how in layouts.items():
+                        if name == "szip" and (kind == "b1" or kind == "f2" or not h5.h5z.filter_avail(4)):
+                            continue
+                        f.create_dataset(name, data=stored, dtype=stored.dtype.newbyteorder(order), **how)
+                    names = list(f)
+                for name in names:
+                    check("h5py", "a.h5", want, "--dataset", name)
+    # Many chunks in every index, gaps of fill values, scale and offset, a block before, dense attributes.
+    a = np.random.default_rng(5).integers(-3000, 3000, (61, 43, 37)).astype("i2")
+    want = np.asfortranarray(a.transpose(2, 1, 0))
+    for libver in ("earliest", "latest"):
+        with h5.File("many.h5", "w", libver=libver, userblock_size=512) as f:
+            for name, how in {"tree": {}, "grows": {"maxshape": (None, 43, 37)}, "grows twice": {"maxshape": (None,) * 3}}.items():
+                d = f.create_dataset(name, data=a, chunks=(3, 4, 5), compression="gzip", shuffle=True, **how)
+                for i in range(20):
+                    d.attrs[f"a{i}"] = "x" * 50
+            f.create_dataset("scaled", data=a, chunks=(8, 8, 8), scaleoffset=0)
+            d = f.create_dataset("gaps", shape=a.shape, dtype="i2", chunks=(8, 8, 8), fillvalue=-7)
+            d[10:20, 5:30, 8:] = a[10:20, 5:30, 8:]
+            gaps = np.asfortranarray(d[...].transpose(2, 1, 0))
+            groups = f.create_group("groups")
+            for i in range(300):
+                groups.create_group(f"g{i}")
+            groups["g299"].create_dataset("deep", data=a)
+        for name in ("tree", "grows", "grows twice", "scaled", "groups/g299/deep"):
+            check("h5py, many chunks", "many.h5", want, "--dataset", name)
+        check("h5py, many chunks", "many.h5", gaps, "--dataset", "gaps")
+        t = np.stack([a, a + 1, a + 2])
+        with h5.File("t.h5", "w", libver=libver) as f:
+            d = f.create_dataset("t", data=t, chunks=(1, 8, 8, 8), compression="gzip")
+            d.attrs["element_size_um"] = [0.0, 3.0, 2.0, 1.5]
+            for i, name in enumerate("tzyx"):
+                d.dims[i].label = name
+        check("h5py, times", "t.h5", np.asfortranarray(t[2].transpose(2, 1, 0)), "--time", "2",
+              steps=np.diag([1.5e-3, 2e-3, 3e-3]), origin=[0, 0, 0])
+    minc(h5)
+
+
+def minc(h5):
+    """MINC 2 by h5py, in every order of dimensions; values and places are nibabel's."""
+    import itertools
+    import nibabel
+    rng = np.random.default_rng(6)
+    steps, starts = {"x": -1.5, "y": 2.0, "z": 3.25}, {"x": 10.0, "y": -20.0, "z": 5.5}
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    for order in itertools.permutations("xyz"):
+        for kind in ("u1", "i1", "u2", "i2", "i4", "f4", "f8"):
+            for slices in (False, True):
+                a = (rng.normal(size=(4, 5, 6)) * 50).clip(0 if kind[0] == "u" else -120, 120).astype(kind)
+                # nibabel keeps files open.
+                path = f"{''.join(order)}_{kind}_{slices}.mnc"
+                with h5.File(path, "w", libver="latest") as f:
+                    for i, c in enumerate("xyz"):
+                        d = f.create_dataset(f"minc-2.0/dimensions/{c}space", data=0)
+                        d.attrs.update({"step": steps[c], "start": starts[c], "direction_cosines": turn[i],
+                                        "units": np.bytes_("mm")})
+                    g = f.create_group("minc-2.0/image/0")
+                    d = g.create_dataset("image", data=a, chunks=(2, 3, 4), compression="gzip")
+                    d.attrs["dimorder"] = np.bytes_(",".join(c + "space" for c in order))
+                    if kind[0] != "f":
+                        d.attrs["valid_range"] = np.array([2.0, 100.0])
+                    for name, v in (("image-min", [-3.0, 1.0, 2.0, 4.0]), ("image-max", [7.0, 9.0, 22.0, 40.0])):
+                        d = g.create_dataset(name, data=np.array(v) if slices else v[0])
+                        d.attrs["dimorder"] = np.bytes_(order[0] + "space" if slices else "")
+                image = nibabel.load(path)
+                want = image.get_fdata().transpose(2, 1, 0)
+                near("MINC 2 as nibabel", path, want, 1e-5)
+                info = json.loads(run("info", path, "--json").stdout)
+                affine = image.affine[:3, :3].T[::-1]
+                row = counts["MINC 2 as nibabel"]
+                if not (np.allclose(info["steps"], affine) and np.allclose(info["origin"], image.affine[:3, 3])):
+                    row[1] += 1
+                    print(f"DIFFERS: MINC {order} {info['steps']} {info['origin']} want {image.affine}")
+
+
+def netCDF4():
+    nc = peer["netCDF4"]
+    for kind in TYPES:
+        for how in ({}, {"zlib": True, "shuffle": True, "chunksizes": (1, 2, 3, 4)}, {"fletcher32": True}):
+            a = numbers(kind, (2,))
+            stored = np.ascontiguousarray(a.transpose(3, 2, 1, 0))
+            with nc.Dataset("a.nc", "w") as f:
+                for name, size in (("time", None), ("depth", 3), ("y", 5), ("x", 7)):
+                    f.createDimension(name, size)
+                for name, values, unit in (("depth", [9.0, 6.0, 3.0], "m"), ("y", np.arange(5) * 0.5, "m"),
+                                           ("x", np.arange(7) * 0.25 + 1, "m"), ("time", [0.0, 1.0], "days since 2000-1-1")):
+                    v = f.createVariable(name, "f8", (name,))
+                    v[:], v.units = values, unit
+                v = f.createVariable("v", kind, ("time", "depth", "y", "x"), fill_value=False, **how)
+                v[:] = stored
+                p = f.createVariable("packed", "i2", ("depth", "y", "x"), fill_value=-1)
+                p.set_auto_maskandscale(False)
+                packed = np.arange(105, dtype="i2").reshape(3, 5, 7) - 20
+                p[:], p.scale_factor, p.add_offset = packed, 0.25, 100.0
+            for t in range(2):
+                check("netCDF4", "a.nc", a[..., t], "--dataset", "v", "--time", str(t),
+                      steps=[[250, 0, 0], [0, 500, 0], [0, 0, -3000]], origin=[1000, 0, 9000])
+            want = np.where(packed == -1, np.nan, packed * 0.25 + 100).astype("f4")
+            check("netCDF4, packed", "a.nc", np.asfortranarray(want.transpose(2, 1, 0)), "--dataset", "packed")
+    with nc.Dataset("old.nc", "w", format="NETCDF3_CLASSIC") as f:
+        f.createDimension("x", 2)
+    refuse("netCDF4, NetCDF 3", "old.nc", "is a NetCDF 3 file, which is not read; convert it with nccopy")
 
 
 def numpy():

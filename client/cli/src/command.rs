@@ -3,7 +3,7 @@
 use crate::lab::{self, LabArgs, LabCommand};
 use crate::{
     cancel, compare, completions, config, convert, demo, doctor, help, info, jobs, logging, man,
-    master, read_dicom, render, rerender, status, tf, volumes, worker,
+    master, read_dicom, read_hdf5, render, rerender, status, tf, volumes, worker,
 };
 use clap::{Arg, Command, CommandFactory, Parser, Subcommand};
 use std::fmt::Write;
@@ -61,6 +61,8 @@ pub(crate) enum Commands {
     Help(help::HelpArgs),
     #[command(hide = true)]
     ReadDicom(read_dicom::DicomArgs),
+    #[command(hide = true)]
+    ReadHdf5(read_hdf5::Hdf5Args),
     /// Experiments by their old names, hidden by [`command`].
     #[command(flatten)]
     OldName(LabCommand),

@@ -27,6 +27,7 @@ mod master;
 mod master_client;
 mod orient;
 mod read_dicom;
+mod read_hdf5;
 mod render;
 mod rerender;
 mod status;
@@ -85,6 +86,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Commands::Man(args) => man::run(args, command()),
         Commands::Help(args) => help::run(args, command()),
         Commands::ReadDicom(args) => read_dicom::run(args),
+        Commands::ReadHdf5(args) => read_hdf5::run(args),
         Commands::OldName(experiment) => experiment.run_by_old_name(),
     }
 }

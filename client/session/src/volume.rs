@@ -33,7 +33,7 @@ pub struct InputArgs {
     #[arg(long, value_name = "ORDER", value_parser = parse::byte_order, help_heading = HEADING,
           hide_short_help = true)]
     byte_order: Option<bool>,
-    /// Distances of samples of raw numbers, pictures or NumPy arrays, such as 0.5x0.5x1.25
+    /// Distances of samples of raw numbers, pictures, NumPy arrays or HDF5, such as 0.5x0.5x1.25
     /// [default: 1x1x1]
     #[arg(long, value_name = "AxBxC", value_parser = parse::spacing, help_heading = HEADING,
           hide_short_help = true)]
@@ -46,8 +46,8 @@ pub struct InputArgs {
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     series: Option<String>,
-    /// Which array of a file of several (.npz, .vti, .vtk): its name [default: the only one, or the
-    /// first]
+    /// Which array of a file of several (.npz, .vti, .vtk, .h5, .hdf5, .ims): its name [default: the
+    /// only one, the first, or the largest]
     #[arg(long, value_name = "NAME", help_heading = HEADING,
           hide_short_help = true)]
     dataset: Option<String>,
@@ -107,7 +107,8 @@ impl InputArgs {
             raw,
             series: self.series.clone(),
             dataset: self.dataset.clone(),
-            dicom_reader: dicom_reader(),
+            dicom_reader: reader("read-dicom"),
+            hdf5_reader: reader("read-hdf5"),
             level: match self.level {
                 Some(LevelChoice::At(level)) => Some(level),
                 Some(LevelChoice::Auto) | None => None,
@@ -339,11 +340,12 @@ fn cache_folder() -> Option<PathBuf> {
     variable("SLABCAST_CACHE").or_else(|| variable("CACHE_DIRECTORY")).or_else(users)
 }
 
-/// Returns the command line of the child process that parses DICOM (`slabcast read-dicom`). `None`
-/// if the system does not tell the path of this program: then a thread parses.
-fn dicom_reader() -> Option<Vec<OsString>> {
+/// Returns the command line of the child process that parses a format by a hidden command (such as
+/// `slabcast read-dicom`). `None` if the system does not tell the path of this program: then a thread
+/// parses.
+fn reader(command: &str) -> Option<Vec<OsString>> {
     let program = std::env::current_exe().ok()?;
-    Some(vec![program.into(), "read-dicom".into()])
+    Some(vec![program.into(), command.into()])
 }
 
 /// Opens a file, a folder or a `formula:` volume without any flags.

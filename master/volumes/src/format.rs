@@ -85,7 +85,10 @@ mod tests {
         let numpy = npy::tests::npy(1, "<u2", false, "(2, 3, 4)");
         for bytes in [numpy.clone(), mgh::tests::mgh(0, true), nifti] {
             let e = open(bytes, &dataset).unwrap_err();
-            assert!(e.contains("--dataset: is for .npz, .vti, .vtk, and this is"), "{e}");
+            assert!(
+                e.contains("--dataset: is for .npz, .vti, .vtk, .h5, .hdf5, .ims, and this is"),
+                "{e}"
+            );
         }
         let raw = RawHints { spacing: Some([1.0, 2.0, 3.0]), ..RawHints::default() };
         let spaced = Hints { raw, ..Hints::default() };

@@ -655,6 +655,36 @@ fn jpeg_2000_mutants_neither_panic_nor_hang_nor_fill_memory() {
     );
 }
 
+/// Files and their samples, as the parser writes them into its pipe.
+#[cfg(feature = "hdf5")]
+#[test]
+fn hdf5_mutants_neither_panic_nor_hang_nor_fill_memory() {
+    use crate::hdf5::tests::{IMARIS, LATEST, NETCDF, PLAIN, SLICES, VTKHDF, WHOLE};
+    let seeds = [PLAIN, LATEST, IMARIS, SLICES, WHOLE, NETCDF, VTKHDF].map(<[u8]>::to_vec);
+    survive(
+        "hdf5",
+        mutants(),
+        |rng| seed_or_mutant(rng, &seeds),
+        |bytes| crate::hdf5::write_bytes(bytes, &mut Limited(1 << 20)).map(|()| None),
+    );
+}
+
+/// Takes some bytes and no more, as the reader of the pipe does: it checks sizes before the samples.
+#[cfg(feature = "hdf5")]
+struct Limited(usize);
+
+#[cfg(feature = "hdf5")]
+impl Write for Limited {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0 = self.0.saturating_sub(bytes.len());
+        if self.0 == 0 { Err(std::io::ErrorKind::BrokenPipe.into()) } else { Ok(bytes.len()) }
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
 /// Runs a tenth of the number of mutants, since each writes files first.
 #[cfg(feature = "zarr")]
 #[test]

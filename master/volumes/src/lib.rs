@@ -27,6 +27,8 @@
 //! - MRC and CCP4 maps: `.mrc`, `.map`, `.ccp4`, `.rec`, `.st`
 //! - NumPy: `.npy`, and one array of an `.npz`
 //! - VTK image data in XML: `.vti`; legacy VTK structured points: `.vtk`
+//! - HDF5: one dataset (`.h5`, `.hdf5`), Imaris (`.ims`), MINC 2 (`.mnc`), NetCDF-4 (`.nc`) and VTKHDF
+//!   (`.vtkhdf`; feature `hdf5`)
 //! - TIFF: the pages of one file (`.tif`, `.tiff`), or a folder of single pages
 //! - PNG, JPEG: a folder of pictures
 //! - raw numbers (`.raw`), with size and type from flags or from the file's name
@@ -59,6 +61,8 @@ pub mod formula;
 pub mod framing;
 #[cfg(test)]
 mod fuzz;
+#[cfg(feature = "hdf5")]
+pub mod hdf5;
 mod limit;
 mod members;
 mod metaimage;
@@ -117,7 +121,10 @@ pub struct Hints {
     /// Program and first arguments of the process that parses DICOM by calling `dicom::serve`.
     /// `None` parses in a thread of this process, without limits on memory and time.
     pub dicom_reader: Option<Vec<std::ffi::OsString>>,
-    /// The array to read where a file holds several (`.npz`, `.vti`, `.vtk`), by its name.
+    /// Program and first arguments of the process that parses HDF5 by calling `hdf5::serve`. `None`
+    /// parses in a thread of this process, without limits on memory and time.
+    pub hdf5_reader: Option<Vec<std::ffi::OsString>>,
+    /// The array to read where a file holds several (`.npz`, `.vti`, `.vtk`, HDF5), by its name or path.
     pub dataset: Option<String>,
     /// Level of a Zarr pyramid, 0 the finest. `None` takes the finest that fits `max_bytes`, or a
     /// quarter of the free memory.
@@ -221,13 +228,17 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
         return folder::open(path, hints);
     }
     #[cfg_attr(
-        not(feature = "dicom"),
-        expect(unused_mut, reason = "only the DICOM check reads the head")
+        not(any(feature = "dicom", feature = "hdf5")),
+        expect(unused_mut, reason = "only the checks for DICOM and HDF5 read the head")
     )]
     let mut source = Source { cap: hints.cap(), ..Source::open(path, "file")? };
     #[cfg(feature = "dicom")]
     if dicom::sniff(source.head()?) && hints.raw.dims.is_none() {
         return folder::open_series_of(path, hints);
+    }
+    #[cfg(feature = "hdf5")]
+    if hdf5::sniff(source.head()?) && hints.raw.dims.is_none() {
+        return hdf5::open(path, hints);
     }
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let folder = path.parent().unwrap_or(Path::new("."));
@@ -400,6 +411,8 @@ fn describe(head: &[u8], name: &str) -> String {
     let ends = |e: &str| name.to_ascii_lowercase().ends_with(e);
     let what = if head.get(128..132) == Some(b"DICM") || ends(".dcm") {
         "is DICOM, which this build does not read (feature `dicom`)"
+    } else if head.starts_with(b"\x89HDF") {
+        "is HDF5, which this build does not read (feature `hdf5`)"
     } else if ends(".mhd") || ends(".mha") {
         "does not begin with a MetaImage header, so it is damaged or something else"
     } else if head.starts_with(b"<?xml") || ends(".vti") {

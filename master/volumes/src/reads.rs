@@ -98,6 +98,14 @@ pub(crate) const LEGACY_VTK: &ReadFormat = &ReadFormat {
     named: true,
     ..read("legacy VTK", &[".vtk", ".vtk.gz"], &[Flag::Dataset])
 };
+pub(crate) const HDF5: &ReadFormat = &ReadFormat {
+    named: true,
+    ..read(
+        "HDF5",
+        &[".h5", ".hdf5", ".ims", ".mnc", ".nc", ".vtkhdf"],
+        &[Flag::Spacing, Flag::Dataset],
+    )
+};
 pub(crate) const TIFF: &ReadFormat = &read("TIFF", &[".tif", ".tiff"], &[Flag::Spacing]);
 pub(crate) const PICTURES: &ReadFormat = &ReadFormat {
     documented: "PNG, JPEG",
@@ -116,7 +124,7 @@ pub(crate) const FORMULA: &ReadFormat =
     &ReadFormat { documented: "by formula", ..read("formula:NAME", &[], &[]) };
 
 /// All formats that are read, in the order of messages.
-pub const FORMATS: [&ReadFormat; 17] = [
+pub const FORMATS: [&ReadFormat; 18] = [
     NRRD,
     METAIMAGE,
     NIFTI,
@@ -127,6 +135,7 @@ pub const FORMATS: [&ReadFormat; 17] = [
     NUMPY_ARCHIVE,
     VTI,
     LEGACY_VTK,
+    HDF5,
     TIFF,
     PICTURES,
     DICOM,
@@ -254,10 +263,10 @@ mod tests {
         let said = remedy();
         let want = "give NRRD, MetaImage, NIfTI, ANALYZE, FreeSurfer (.mgh, .mgz), MRC (.mrc, .map, \
                     .ccp4), NumPy (.npy), NumPy archives (.npz), VTK image data (.vti), legacy VTK \
-                    (.vtk), TIFF, a folder of PNG or JPEG pictures, DICOM slices, Zarr, OME-Zarr, \
+                    (.vtk), HDF5 (.h5, .hdf5, .ims), TIFF, a folder of PNG or JPEG pictures, DICOM slices, Zarr, OME-Zarr, \
                     raw numbers with --dims and --type or formula:NAME";
         assert_eq!(said, want);
-        assert_eq!(takers(Flag::Dataset), ".npz, .vti, .vtk");
+        assert_eq!(takers(Flag::Dataset), ".npz, .vti, .vtk, .h5, .hdf5, .ims");
         assert_eq!(takers(Flag::Series), "DICOM slices");
         for name in ["a.NII.gz", "b.mgz", "c.tif", "x.raw"] {
             assert!(is_volume_name(name), "{name}");
@@ -278,6 +287,9 @@ mod tests {
         let e = crate::open_with("formula:spheres:8".as_ref(), &series).unwrap_err().to_string();
         assert!(e.contains("--series: is for DICOM slices, and this is formula:NAME"), "{e}");
         let e = dataset.check_flags(NRRD).unwrap_err().to_string();
-        assert!(e.contains("--dataset: is for .npz, .vti, .vtk, and this is NRRD"), "{e}");
+        assert!(
+            e.contains("--dataset: is for .npz, .vti, .vtk, .h5, .hdf5, .ims, and this is NRRD"),
+            "{e}"
+        );
     }
 }

@@ -21,6 +21,7 @@ use Mark::{At, Begins, Name, Text};
 const MICROSCOPE: &str =
     "convert it with bioformats2raw (to OME-Zarr), or save it as TIFF with Fiji";
 const SAVE_ARRAY: &str = "read it in Python and save one volume with numpy.save('one.npy', array)";
+const NETCDF_4: &str = "convert it with nccopy -k nc4 IN OUT.nc";
 const GIVE_RAW: &str = "give the file of numbers that it names, with the sizes and the type that it \
                         says as --dims and --type";
 
@@ -31,27 +32,20 @@ const UNREAD: &[(Mark, &str, &str)] = &[
     (Begins(b"GIF8"), "is a GIF picture", "save its frames as PNG files in one folder"),
     (Begins(b"BM"), "is a BMP picture", "save the stack as PNG or TIFF, and give its folder"),
     (Begins(b"\x76\x2f\x31\x01"), "is an OpenEXR picture", "save the stack as TIFF of float32"),
-    (Name(".ims"), "is an Imaris file (HDF5)", MICROSCOPE),
-    (
-        Begins(b"MATLAB 7.3"),
-        "is a MATLAB file (HDF5)",
-        "read it with Python's h5py and save one volume with numpy.save",
-    ),
     (
         Begins(b"MATLAB 5.0"),
         "is a MATLAB file",
         "read it with scipy.io.loadmat and save one volume with numpy.save",
     ),
-    (Name(".mnc"), "is a MINC file", "convert it with mnc2nii"),
-    (Name(".vtkhdf"), "is a VTKHDF file", "save it as .vti with ParaView"),
+    (Name(".mnc"), "is a MINC 1 file", "convert it with mincconvert -2, or with mnc2nii"),
+    (Begins(b"CDF\x01"), "is a NetCDF 3 file", NETCDF_4),
+    (Begins(b"CDF\x02"), "is a NetCDF 3 file", NETCDF_4),
+    (Begins(b"CDF\x05"), "is a NetCDF 3 file", NETCDF_4),
     (
-        Begins(b"\x89HDF"),
-        "is an HDF5 file",
-        "read it with Python's h5py and save one data set with numpy.save",
+        Begins(b"\x0e\x03\x13\x01"),
+        "is an HDF4 file",
+        "convert it to HDF5 with h4toh5, or save one array with numpy.save",
     ),
-    (Begins(b"CDF\x01"), "is a NetCDF file", SAVE_ARRAY),
-    (Begins(b"CDF\x02"), "is a NetCDF file", SAVE_ARRAY),
-    (Begins(b"CDF\x05"), "is a NetCDF file", SAVE_ARRAY),
     (Text("BYTEORDER_STRING"), "is the header of an AFNI volume", "convert it with 3dAFNItoNIFTI"),
     (Name(".brik"), "is the data of an AFNI volume", "convert it with 3dAFNItoNIFTI"),
     (Name(".brik.gz"), "is the data of an AFNI volume", "convert it with 3dAFNItoNIFTI"),
@@ -214,8 +208,8 @@ mod tests {
     #[test]
     fn format_that_is_not_read_is_named_with_the_program_that_converts_it() {
         for (start, name, say) in [
-            (&b"\x89HDF\r\n"[..], "a.h5", "is an HDF5 file, which is not read; read it with"),
-            (b"\x89HDF\r\n", "a.ims", "Imaris file (HDF5), which is not read; convert it"),
+            (&b"CDF\x01"[..], "a.nc", "is a NetCDF 3 file, which is not read; convert it with"),
+            (b"CDF\x01", "a.mnc", "is a MINC 1 file, which is not read; convert it with"),
             (b"\ntype = string-attribute\nname = BYTEORDER_STRING", "a.HEAD", "3dAFNItoNIFTI"),
             (b"ObjectFileName: a.raw\nResolution: 4 3 2", "a.dat", "QVis volume"),
             (b"ZISRAWFILE\0", "a.czi", "bioformats2raw"),

@@ -138,7 +138,7 @@ fn help_groups_every_command_once() {
         for group in ["Pictures", "Cluster", "Laboratory", "Setup"] {
             assert!(help.contains(group), "{help}");
         }
-        assert!(!help.contains("read-dicom"), "{help}");
+        assert!(!help.contains("read-dicom") && !help.contains("read-hdf5"), "{help}");
     }
 }
 

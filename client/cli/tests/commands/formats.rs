@@ -144,6 +144,26 @@ fn convert_writes_a_pyramid_whose_finest_level_is_the_volume() {
     assert_eq!(crate::program::names(dir.path()), ["x.ome.zarr"], "nothing else is left");
 }
 
+/// By way of the hidden command, whose process confines itself.
+#[test]
+fn hdf5_is_read_by_a_process_of_its_own() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("cells.ims");
+    std::fs::write(&file, include_bytes!("../../../../master/volumes/src/hdf5/samples/cells.ims"))
+        .unwrap();
+    let most = |more: &[&str]| info(dir.path(), &file, more)["values"]["max"].clone();
+    assert_eq!(most(&[]), serde_json::json!(520.0));
+    assert_eq!(most(&["--time", "1", "--channel", "1"]), serde_json::json!(3520.0));
+    let path = "/DataSet/ResolutionLevel 0/TimePoint 1/Channel 0/Data";
+    assert_eq!(most(&["--dataset", path]), serde_json::json!(1520.0));
+    assert_eq!(most(&["--spacing", "1x2x0.5"]), serde_json::json!(520.0));
+    // A file that ends early, and the process with it.
+    std::fs::write(&file, &std::fs::read(&file).unwrap()[..3000]).unwrap();
+    let out = run(dir.path(), &["info", &file.to_string_lossy()]);
+    assert_eq!(out.status.code(), Some(1));
+    assert!(text(&out.stderr).contains("cells.ims: "), "{}", text(&out.stderr));
+}
+
 #[test]
 fn dataset_flag_takes_one_of_several_arrays() {
     let dir = tempfile::tempdir().unwrap();

@@ -1,7 +1,7 @@
 //! Reader of DICOM series: a folder of slices, sorted by position, becomes one volume.
 //!
 //! Files are not trusted, so a process of its own parses them ([`serve`]). It confines itself to
-//! reading their folder, and sends the series and its samples through a pipe ([`crate::confined`]). The
+//! reading their folder, and sends the series and its samples through a pipe (`confined`). The
 //! caller names the program ([`crate::Hints::dicom_reader`]); without one a thread parses them,
 //! unconfined.
 

@@ -16,7 +16,7 @@ use crate::brick_sets::BrickSets;
 use crate::finish::Assembly;
 use crate::finishers::Finishers;
 use crate::hooks::Hooks;
-use crate::jobs::active::ActiveJobs;
+use crate::jobs::active::{ActiveJobs, Submitter};
 use crate::jobs::submit::{Plan, SubmitError};
 use crate::jobs::{FinishedFrame, JobState, Jobs};
 use crate::library::Library;
@@ -31,7 +31,6 @@ use slabcast_proto::model::Worker;
 use slabcast_schedule::{Clock, Event as Happened, Micros};
 use slabcast_volumes::BrickStore;
 use std::collections::BTreeMap;
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
@@ -54,7 +53,7 @@ pub(crate) enum Event {
     /// A client's request was checked.
     Submit {
         plan: Box<Plan>,
-        peer: Option<IpAddr>,
+        submitter: Submitter,
         reply: oneshot::Sender<Result<JobId, SubmitError>>,
     },
     /// A brick set was cut.
@@ -69,6 +68,8 @@ pub(crate) enum Event {
     FinishFailed { frame: FrameId, reason: String },
     /// A client cancels a job.
     Cancel { job: JobId, reply: oneshot::Sender<bool> },
+    /// Nobody wants a job's frames any more, nor to hear of it.
+    Forget { job: JobId },
     /// Somebody asks for the workers.
     Workers { reply: oneshot::Sender<Vec<Worker>> },
     /// The master ends.
@@ -253,8 +254,8 @@ impl Driver {
                     self.refresh_states();
                 }
             }
-            Event::Submit { plan, peer, reply } => {
-                let _ = reply.send(self.submit(*plan, peer));
+            Event::Submit { plan, submitter, reply } => {
+                let _ = reply.send(self.submit(*plan, submitter));
             }
             Event::BricksCut { set, store } => self.bricks_cut(set, store),
             Event::BricksLost { worker, set, bricks, reason } => {
@@ -270,6 +271,12 @@ impl Driver {
                     self.end_job(job, JobState::Cancelled);
                 }
                 let _ = reply.send(is_active);
+            }
+            Event::Forget { job } => {
+                if self.active.contains(job) {
+                    self.end_job(job, JobState::Cancelled);
+                }
+                self.jobs.lock().forget(job);
             }
             Event::Workers { reply } => {
                 let seen = self.scheduler.workers().into_iter();

@@ -3,7 +3,7 @@
 use crate::lab::{self, LabArgs, LabCommand};
 use crate::{
     cancel, compare, completions, config, convert, demo, doctor, help, info, jobs, logging, man,
-    master, read_dicom, render, rerender, status, tf, volumes, worker,
+    master, read_dicom, render, rerender, status, tf, view, volumes, worker,
 };
 use clap::{Arg, Command, CommandFactory, Parser, Subcommand};
 use std::fmt::Write;
@@ -39,6 +39,7 @@ pub(crate) struct Cli {
 #[derive(Subcommand, Debug)]
 pub(crate) enum Commands {
     Render(Box<render::RenderArgs>),
+    View(Box<view::ViewArgs>),
     Compare(Box<compare::CompareArgs>),
     Rerender(rerender::RerenderArgs),
     Info(info::InfoArgs),
@@ -68,7 +69,7 @@ pub(crate) enum Commands {
 
 /// Groups of the help and their commands, in its order.
 pub(crate) const GROUPS: [(&str, &[&str]); 4] = [
-    ("Pictures", &["render", "compare", "rerender", "info", "convert", "tf", "demo"]),
+    ("Pictures", &["render", "view", "compare", "rerender", "info", "convert", "tf", "demo"]),
     ("Cluster", &["master", "worker", "status", "jobs", "cancel", "volumes", "put", "rm"]),
     ("Laboratory", &["lab"]),
     ("Setup", &["config", "doctor", "completions", "man", "help"]),

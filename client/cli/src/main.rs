@@ -26,6 +26,7 @@ mod man;
 mod master;
 mod master_client;
 mod orient;
+mod page;
 mod read_dicom;
 mod render;
 mod rerender;
@@ -33,6 +34,7 @@ mod status;
 mod systemd;
 mod tf;
 mod usage;
+mod view;
 mod volumes;
 mod worker;
 
@@ -65,6 +67,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
     match &cli.command {
         Commands::Render(args) => render::run(args),
         Commands::Rerender(args) => rerender::run(args),
+        Commands::View(args) => view::run(args),
         Commands::Compare(args) => compare::run(args),
         Commands::Info(args) => info::run(args),
         Commands::Convert(args) => convert::run(args),

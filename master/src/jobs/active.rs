@@ -70,11 +70,35 @@ impl ActiveJob {
 pub(crate) struct ActiveJobs {
     by_id: BTreeMap<JobId, ActiveJob>,
     order: VecDeque<JobId>,
-    /// Addresses with jobs (`None`: this process). A new address starts with the least work of all
+    /// Addresses and live sessions with jobs. A new address starts with the least work of all
     /// others: it is served at once, and can't claim the time before it came.
-    peers: BTreeMap<Option<IpAddr>, Peer>,
-    peer_of: BTreeMap<JobId, Option<IpAddr>>,
+    peers: BTreeMap<Submitter, Peer>,
+    peer_of: BTreeMap<JobId, Submitter>,
     last_client: u64,
+}
+
+/// Whom a job is drawn for. Different ones share all threads.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Submitter {
+    /// A live session of this number: one frame at a time, which a person waits for.
+    Live(u64),
+    /// An address; `None`: this process.
+    Batch(Option<IpAddr>),
+}
+
+impl Submitter {
+    /// Returns the address that limits count by; `None` for this process, live sessions included.
+    pub(crate) fn peer(self) -> Option<IpAddr> {
+        match self {
+            Submitter::Live(_) => None,
+            Submitter::Batch(peer) => peer,
+        }
+    }
+
+    /// Returns whether this is a live session.
+    pub(crate) fn is_live(self) -> bool {
+        matches!(self, Submitter::Live(_))
+    }
 }
 
 /// An address with jobs.
@@ -94,7 +118,7 @@ fn guessed_us(making_bytes: u64) -> u64 {
 }
 
 impl ActiveJobs {
-    pub(crate) fn insert(&mut self, id: JobId, job: ActiveJob, peer: Option<IpAddr>) {
+    pub(crate) fn insert(&mut self, id: JobId, job: ActiveJob, peer: Submitter) {
         let least = self.peers.values().map(|peer| peer.work_us).min().unwrap_or(0);
         self.peers.entry(peer).or_insert_with(|| {
             self.last_client += 1;

@@ -150,7 +150,7 @@ impl Viewer {
 
     /// Returns the viewer at an address. A file's name may be a patient's, so others than this
     /// machine's callers are told names only if `show_names`.
-    pub(crate) fn at(address: Option<IpAddr>, show_names: bool) -> Viewer {
+    pub fn at(address: Option<IpAddr>, show_names: bool) -> Viewer {
         let is_here = address.is_none_or(|ip| ip.to_canonical().is_loopback());
         Viewer { address: address.map(counted_as), may_know_names: is_here || show_names }
     }

@@ -1,0 +1,31 @@
+//! The page of a master: its files, live pictures over a WebSocket, and calls over HTTP
+//! (docs/reference/live.md).
+//!
+//! - [`serve`] answers connections that the master's listener passes on.
+//! - `slot` decides which pass a session draws next, `preview` how coarsely it moves; both are pure.
+//! - `session` is one page: it reads, draws, encodes and writes. `picture` draws one pass as a job of
+//!   one frame of the master, `tile` encodes it.
+//! - `volume` describes a volume for an editor, `news` tells of jobs, workers and volumes.
+//! - `guard` knows who may call, `http` has the calls beside the socket, `assets` the page's files.
+//!
+//! Nothing here draws: workers do. Nothing slow runs on the runtime's threads: reading and encoding
+//! have threads of their own.
+
+mod assets;
+mod guard;
+mod http;
+mod messages;
+mod news;
+mod picture;
+mod preview;
+mod problem;
+mod server;
+mod session;
+mod shared;
+mod slot;
+mod tile;
+mod volume;
+
+pub use server::serve;
+pub use shared::LiveConfig;
+pub use volume::Home;

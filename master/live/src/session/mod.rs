@@ -1,0 +1,690 @@
+//! A session: one page, its slot, and what it is told.
+//!
+//! One task owns the state. It reads messages, begins passes, and queues what goes out; a second task
+//! writes to the socket, so that a slow link never keeps messages from being read. What is slow
+//! (opening a volume, drawing, encoding) runs in tasks of its own and comes back as an [`Outcome`].
+
+mod asks;
+
+use crate::messages::{Ack, Head, Hello, LONGEST, Open, Ping, Scene, View, WatchAsk};
+use crate::picture::{self, Drawn, Order, check_size, request_of};
+use crate::preview::Preview;
+use crate::problem::Problem;
+use crate::server::stopped;
+use crate::shared::{LIVE_EDGE, LIVE_PIXELS, Shared, unix_ms};
+use crate::slot::{Pair, Pass, Slot, Step};
+use crate::tile::Codecs;
+use crate::volume::{Shown, describe};
+use axum::extract::ws::{CloseFrame, Message, WebSocket};
+use futures_util::stream::{SplitSink, SplitStream};
+use futures_util::{SinkExt, StreamExt};
+use serde::de::DeserializeOwned;
+use serde_json::{Value, json};
+use slabcast_master::jobs::FinishedFrame;
+use slabcast_master::library::Viewer;
+use slabcast_scene::request::{PathRequest, VolumeChoice};
+use std::collections::VecDeque;
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use tokio::sync::mpsc;
+use tokio::task::{AbortHandle, JoinSet};
+use tracing::debug;
+
+/// Time for the first message.
+const HELLO: Duration = Duration::from_secs(5);
+
+/// Interval of WebSocket pings.
+const PING: Duration = Duration::from_secs(20);
+
+/// Time after which a socket that takes no byte is given up.
+const STUCK: Duration = Duration::from_secs(60);
+
+/// Messages that wait for the socket's writer. Others wait in the session's own queue, where those
+/// of an old pass can be dropped.
+const WRITING: usize = 4;
+
+/// Messages of any kind that wait in the session's queue before it is given up.
+const MOST_QUEUED: usize = 4096;
+
+/// Messages a second that a client may send, and at once.
+const RATE: f64 = 500.0;
+const BURST: f64 = 1000.0;
+
+/// Close codes of docs/reference/live.md.
+pub(crate) mod code {
+    pub(crate) const GOING: u16 = 1001;
+    pub(crate) const RULE: u16 = 1008;
+    pub(crate) const TOO_LONG: u16 = 1009;
+    pub(crate) const PROTOCOL: u16 = 4400;
+    pub(crate) const TOKEN: u16 = 4401;
+    pub(crate) const FULL: u16 = 4429;
+}
+
+/// Why a session ends: a close code, and words.
+struct End(u16, String);
+
+/// What a task of a session brings.
+pub(super) enum Outcome {
+    /// A volume was opened, or not. `hello`: in answer to the first message.
+    Opened { hello: bool, id: u64, result: Result<Box<Shown>, Problem>, then: Option<Box<First>> },
+    /// A pass was drawn. `number`: which.
+    Drawn { number: u64, result: Result<Box<Drawn>, Problem> },
+    /// The present state of what is watched.
+    News(crate::news::Snapshot),
+    /// Messages to be sent.
+    Say(Vec<Message>),
+}
+
+/// View and scene that come with a volume.
+#[derive(Clone, Debug)]
+pub(super) struct First {
+    view: Option<View>,
+    scene: Option<Scene>,
+}
+
+/// A message that waits to be written, and the pass that it belongs to.
+struct Queued {
+    message: Message,
+    pass: Option<(Pair, Pass)>,
+}
+
+/// A pass that is being drawn.
+struct Drawing {
+    number: u64,
+    pair: Pair,
+    pass: Pass,
+    rung: usize,
+    request: PathRequest,
+    task: AbortHandle,
+}
+
+struct Session {
+    shared: Arc<Shared>,
+    id: u64,
+    viewer: Viewer,
+    peer: Option<IpAddr>,
+    codecs: Codecs,
+    shown: Option<Arc<Shown>>,
+    opening: bool,
+    size: [u32; 2],
+    view: View,
+    scene: Scene,
+    /// Whether the last moving input was a change of the scene.
+    edited: bool,
+    slot: Slot,
+    preview: Preview,
+    asked_at: Instant,
+    drawing: Option<Drawing>,
+    passes: u64,
+    /// The last frame in all detail, and its request: a still of it need not be drawn again.
+    frame: Option<(PathRequest, Arc<FinishedFrame>)>,
+    /// When passes were sent, for the pace.
+    sent: VecDeque<(Pair, Pass, Instant)>,
+    painted_at: Option<Instant>,
+    queue: VecDeque<Queued>,
+    tasks: JoinSet<Outcome>,
+    watched: Vec<String>,
+    news: crate::news::News,
+    news_asked: bool,
+}
+
+/// Makes a text message.
+pub(super) fn text(value: &Value) -> Message {
+    Message::Text(value.to_string().into())
+}
+
+/// Runs a session until either side closes.
+pub(crate) async fn run(shared: Arc<Shared>, socket: WebSocket, peer: Option<IpAddr>) {
+    let Ok(_place) = shared.sessions.clone().try_acquire_owned() else {
+        let mut socket = socket;
+        let reason = "as many sessions as this master takes; dial again later".into();
+        let _ = socket.send(Message::Close(Some(CloseFrame { code: code::FULL, reason }))).await;
+        return;
+    };
+    let (sink, mut stream) = socket.split();
+    let (to_writer, from_session) = mpsc::channel(WRITING);
+    let writer = tokio::spawn(write(sink, from_session));
+    let end = match begin(&shared, &mut stream, peer).await {
+        Ok((mut session, hello)) => session.live(hello, &mut stream, &to_writer).await,
+        Err(end) => end,
+    };
+    let End(code, reason) = end;
+    debug!(?peer, code, reason, "live session ended");
+    if code != 0 {
+        let mut stop = shared.stop.clone();
+        if code == code::GOING && *stop.borrow_and_update() {
+            let bye = text(&json!({"type": "bye", "text": reason, "retry_ms": 1000}));
+            let _ = tokio::time::timeout(Duration::from_millis(200), to_writer.send(bye)).await;
+        }
+        // A reason has 123 bytes at most.
+        let reason: String = reason.chars().take(60).collect();
+        let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
+        let _ = tokio::time::timeout(Duration::from_secs(1), to_writer.send(close)).await;
+    }
+    drop(to_writer);
+    // The writer ends when it has written, or is stuck.
+    let _ = tokio::time::timeout(Duration::from_secs(2), writer).await;
+}
+
+/// Writes messages to the socket until there are no more, and pings.
+async fn write(mut sink: SplitSink<WebSocket, Message>, mut messages: mpsc::Receiver<Message>) {
+    let mut ping = tokio::time::interval_at(tokio::time::Instant::now() + PING, PING);
+    loop {
+        let message = tokio::select! {
+            message = messages.recv() => message,
+            _ = ping.tick() => Some(Message::Ping(bytes::Bytes::new())),
+        };
+        let Some(message) = message else { break };
+        let is_last = matches!(message, Message::Close(_));
+        match tokio::time::timeout(STUCK, sink.send(message)).await {
+            Ok(Ok(())) if !is_last => {}
+            _ => return,
+        }
+    }
+    let _ = tokio::time::timeout(Duration::from_secs(1), sink.close()).await;
+}
+
+/// Takes the text of a message; what is no text of ours ends the session.
+fn text_of(received: Option<Result<Message, axum::Error>>) -> Result<Option<String>, End> {
+    match received {
+        None | Some(Ok(Message::Close(_))) => Err(End(0, "the client closed".into())),
+        Some(Ok(Message::Text(text))) if text.len() > LONGEST => {
+            Err(End(code::TOO_LONG, "a message is longer than 64 KiB".into()))
+        }
+        Some(Ok(Message::Text(text))) => Ok(Some(text.as_str().to_owned())),
+        Some(Ok(Message::Binary(_))) => {
+            Err(End(code::RULE, "messages from clients are text".into()))
+        }
+        Some(Ok(Message::Ping(_) | Message::Pong(_))) => Ok(None),
+        Some(Err(e)) if e.to_string().to_lowercase().contains("too long") => {
+            Err(End(code::TOO_LONG, "a message is longer than 64 KiB".into()))
+        }
+        Some(Err(e)) => Err(End(0, e.to_string())),
+    }
+}
+
+/// Waits for the first message and checks it.
+async fn begin(
+    shared: &Arc<Shared>,
+    stream: &mut SplitStream<WebSocket>,
+    peer: Option<IpAddr>,
+) -> Result<(Session, Hello), End> {
+    let first = async {
+        loop {
+            if let Some(text) = text_of(stream.next().await)? {
+                return Ok(text);
+            }
+        }
+    };
+    let no_hello = |_| End(code::RULE, "no hello within 5 s".into());
+    let first = tokio::time::timeout(HELLO, first).await.map_err(no_hello)??;
+    let no_json = |e: serde_json::Error| End(code::RULE, format!("hello: {e}"));
+    let head: Head = serde_json::from_str(&first).map_err(no_json)?;
+    if head.kind != "hello" {
+        return Err(End(code::RULE, "the first message is no hello".into()));
+    }
+    let hello: Hello = serde_json::from_str(&first).map_err(no_json)?;
+    let [oldest, newest] = hello.protocol;
+    if oldest > 1 || newest < 1 {
+        let words = format!("this master speaks 1, the page {oldest} to {newest}");
+        return Err(End(code::PROTOCOL, words));
+    }
+    if !shared.guard.knows_token(hello.token.as_deref()) {
+        return Err(End(code::TOKEN, "the token is missing or unknown".into()));
+    }
+    check_size(hello.size).map_err(|e| End(code::RULE, e.to_string()))?;
+    let takes = |codec: &str| hello.codecs.iter().any(|c| c == codec);
+    let session = Session {
+        id: shared.fresh_id(),
+        viewer: shared.handle.viewer(peer),
+        peer,
+        codecs: Codecs { jpeg: takes("jpeg"), webp: takes("webp") },
+        shown: None,
+        opening: false,
+        size: hello.size,
+        view: View { seq: 0, camera: Default::default(), size: hello.size, moving: false },
+        scene: Scene::home(0),
+        edited: false,
+        slot: Slot::default(),
+        preview: Preview::default(),
+        asked_at: Instant::now(),
+        drawing: None,
+        passes: 0,
+        frame: None,
+        sent: VecDeque::new(),
+        painted_at: None,
+        queue: VecDeque::new(),
+        tasks: JoinSet::new(),
+        watched: Vec::new(),
+        news: Default::default(),
+        news_asked: false,
+        shared: shared.clone(),
+    };
+    Ok((session, hello))
+}
+
+/// What woke the session.
+enum Woken {
+    Received(Option<Result<Message, axum::Error>>),
+    Done(Option<Result<Outcome, tokio::task::JoinError>>),
+    MayWrite,
+    Time,
+    News,
+    Stop,
+    WriterGone,
+}
+
+impl Session {
+    /// Runs until the session's end, and says why.
+    async fn live(
+        &mut self,
+        hello: Hello,
+        stream: &mut SplitStream<WebSocket>,
+        writer: &mpsc::Sender<Message>,
+    ) -> End {
+        self.welcome();
+        self.watch(hello.watch);
+        let first = First { view: hello.view, scene: hello.scene };
+        self.open(hello.volume, true, 0, Some(first));
+        let mut allowance = (BURST, Instant::now());
+        let mut stop = self.shared.stop.clone();
+        let mut news = tokio::time::interval(crate::news::EVERY);
+        news.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        loop {
+            let until = match self.advance() {
+                Step::Wait(until) => until.map(|at| self.shared.moment(at)),
+                Step::Begin(..) | Step::Drop => None,
+            };
+            let timer = async {
+                match until {
+                    Some(until) => tokio::time::sleep_until(until).await,
+                    None => std::future::pending().await,
+                }
+            };
+            let has_queue = !self.queue.is_empty();
+            let woken = tokio::select! {
+                received = stream.next() => Woken::Received(received),
+                done = self.tasks.join_next(), if !self.tasks.is_empty() => Woken::Done(done),
+                place = writer.reserve(), if has_queue => match place {
+                    Ok(place) => {
+                        if let Some(queued) = self.queue.pop_front() {
+                            place.send(queued.message);
+                        }
+                        Woken::MayWrite
+                    }
+                    Err(_) => Woken::WriterGone,
+                },
+                () = timer => Woken::Time,
+                _ = news.tick(), if !self.watched.is_empty() || self.shown.is_none() => Woken::News,
+                () = stopped(&mut stop) => Woken::Stop,
+            };
+            match woken {
+                Woken::Received(received) => match text_of(received) {
+                    Ok(Some(text)) => {
+                        let (left, since) = &mut allowance;
+                        *left = (*left + RATE * since.elapsed().as_secs_f64()).min(BURST) - 1.0;
+                        *since = Instant::now();
+                        if *left < 0.0 {
+                            return End(code::RULE, "more than 500 messages a second".into());
+                        }
+                        if let Err(end) = self.take(&text) {
+                            return end;
+                        }
+                    }
+                    Ok(None) => {}
+                    Err(end) => return end,
+                },
+                Woken::Done(Some(Ok(outcome))) => self.finish(outcome),
+                // An aborted pass.
+                Woken::Done(_) | Woken::MayWrite | Woken::Time => {}
+                Woken::News => self.ask_news(),
+                Woken::Stop => return End(code::GOING, "the master ends".into()),
+                Woken::WriterGone => return End(0, "the socket takes nothing".into()),
+            }
+            if self.queue.len() > MOST_QUEUED {
+                return End(code::RULE, "the client reads too slowly".into());
+            }
+        }
+    }
+
+    fn say(&mut self, value: &Value) {
+        self.queue.push_back(Queued { message: text(value), pass: None });
+    }
+
+    fn refuse(&mut self, problem: &Problem, re: &str, id: u64) {
+        self.say(&problem.message(re, id));
+    }
+
+    fn welcome(&mut self) {
+        let shared = self.shared.clone();
+        let limits = json!({
+            "live_edge": LIVE_EDGE, "live_pixels": LIVE_PIXELS,
+            "picture_edge": crate::http::PICTURE_EDGE, "upload_bytes": crate::http::UPLOAD_BYTES,
+            "chunk_bytes": crate::http::CHUNK_BYTES, "state_bytes": crate::http::STATE_BYTES,
+            "frames": crate::http::MOVIE_FRAMES,
+        });
+        let name = if shared.config.name.is_empty() {
+            &shared.config.machine
+        } else {
+            &shared.config.name
+        };
+        self.say(&json!({
+            "type": "welcome", "protocol": 1, "server": name,
+            "version": env!("CARGO_PKG_VERSION"),
+            "pixels_version": slabcast_common::PIXELS_VERSION, "now_ms": unix_ms(),
+            "empty": shared.handle.library().list(self.viewer).is_empty(),
+            "roles": ["view", "submit", "upload", "cancel"],
+            "movies": crate::http::movies(&shared), "limits": limits,
+        }));
+    }
+
+    /// Has a volume opened on a thread of its own.
+    fn open(&mut self, name: Option<String>, hello: bool, id: u64, then: Option<First>) {
+        self.opening = true;
+        let (shared, viewer, size) = (self.shared.clone(), self.viewer, self.size);
+        self.tasks.spawn(async move {
+            let choice = match name.clone() {
+                Some(name) => VolumeChoice::Name(name),
+                None => VolumeChoice::Default,
+            };
+            let result = opened(&shared, choice, viewer, size).await;
+            Outcome::Opened { hello, id, result: result.map(Box::new), then: then.map(Box::new) }
+        });
+    }
+
+    fn finish(&mut self, outcome: Outcome) {
+        match outcome {
+            Outcome::Opened { hello, id, result: Ok(shown), then } => {
+                self.opened(*shown, then.map(|then| *then), hello, id);
+            }
+            Outcome::Opened { hello, id, result: Err(problem), then } => {
+                self.opening = false;
+                let re = if hello { "hello" } else { "open" };
+                // A master without volumes waits for the first.
+                if hello && !self.any_volume_is_there() {
+                    return;
+                }
+                self.refuse(&problem, re, id);
+                if hello && then.is_some() && self.shown.is_none() {
+                    // Its own volume, and the home view.
+                    self.open(self.any_volume(), true, 0, None);
+                }
+            }
+            Outcome::Drawn { number, result } => self.drawn(number, result),
+            Outcome::News(snapshot) => {
+                self.news_asked = false;
+                for message in self.news.changes(snapshot) {
+                    self.say(&message);
+                }
+                if self.shown.is_none() && !self.opening && self.any_volume_is_there() {
+                    self.open(self.any_volume(), true, 0, None);
+                }
+            }
+            Outcome::Say(messages) => {
+                let queued = messages.into_iter().map(|message| Queued { message, pass: None });
+                self.queue.extend(queued);
+            }
+        }
+    }
+
+    fn any_volume_is_there(&self) -> bool {
+        !self.shared.handle.library().list(self.viewer).is_empty()
+    }
+
+    /// Watches other things, and has their present state told.
+    fn watch(&mut self, of: Vec<String>) {
+        self.watched = of;
+        self.news = Default::default();
+        self.ask_news();
+    }
+
+    /// Has the present state of what is watched looked at, unless that is under way.
+    fn ask_news(&mut self) {
+        if self.news_asked {
+            return;
+        }
+        self.news_asked = true;
+        let (handle, viewer, watched) =
+            (self.shared.handle.clone(), self.viewer, self.watched.clone());
+        self.tasks.spawn(async move {
+            Outcome::News(crate::news::look(&handle, viewer, &watched).await)
+        });
+    }
+
+    /// Returns the first volume that can be read; `None`: the master's own.
+    fn any_volume(&self) -> Option<String> {
+        if self.shared.handle.library().default_volume().is_some() {
+            return None;
+        }
+        let listed = self.shared.handle.library().list(self.viewer);
+        listed.into_iter().find(|entry| entry.problem.is_empty()).map(|entry| entry.name)
+    }
+
+    fn opened(&mut self, shown: Shown, then: Option<First>, hello: bool, id: u64) {
+        self.opening = false;
+        self.drop_pass();
+        self.slot.clear();
+        self.preview = Preview::default();
+        self.frame = None;
+        self.say(&shown.message);
+        let shown = Arc::new(shown);
+        self.shown = Some(shown.clone());
+        let First { view, scene } = then.unwrap_or(First { view: None, scene: None });
+        let re = if hello { "hello" } else { "open" };
+        // The home view has the numbers of the latest view and scene.
+        let (seq, size) = (self.view.seq, self.size);
+        self.view = View { seq, camera: shown.home.clone(), size, moving: false };
+        self.scene = Scene::home(self.scene.rev);
+        if let Some(view) = view {
+            match check_size(view.size) {
+                Ok(()) => {
+                    self.size = view.size;
+                    self.view = view;
+                }
+                Err(e) => self.refuse(&Problem::field(&e), re, id),
+            }
+        }
+        if let Some(scene) = scene {
+            match scene.quality.check() {
+                Ok(()) => self.scene = scene,
+                Err(e) => self.refuse(&Problem::field(&e), re, id),
+            }
+        }
+        self.changed();
+    }
+
+    /// Tells the slot of the latest pair.
+    fn changed(&mut self) {
+        self.asked_at = Instant::now();
+        let is_moving = self.view.moving || self.scene.moving;
+        if self.shown.is_some() && !self.opening {
+            self.slot.change(self.pair(), is_moving, self.shared.now());
+            self.withdraw_old_still();
+        }
+    }
+
+    /// Drops what of a still that is no longer wanted was not written yet. Moving passes go on: on a
+    /// slow link each would be dropped for the next, and none would ever be whole.
+    fn withdraw_old_still(&mut self) {
+        let latest = self.pair();
+        let mut withdrawn = None;
+        self.queue.retain(|queued| match queued.pass {
+            Some((pair, Pass::Still)) if pair != latest => {
+                withdrawn = Some(pair);
+                false
+            }
+            _ => true,
+        });
+        if let Some(pair) = withdrawn {
+            self.slot.withdrawn(pair);
+            self.sent.retain(|(of, pass, _)| (*of, *pass) != (pair, Pass::Still));
+        }
+    }
+
+    fn pair(&self) -> Pair {
+        Pair { seq: self.view.seq, scene: self.scene.rev }
+    }
+
+    /// Takes a message.
+    fn take(&mut self, text: &str) -> Result<(), End> {
+        let head: Head = serde_json::from_str(text).map_err(|e| {
+            End(code::RULE, format!("a message is no JSON object with a type: {e}"))
+        })?;
+        let (kind, id) = (head.kind.clone(), head.id());
+        if let Err(problem) = self.act(&head, text) {
+            self.refuse(&problem, &kind, id);
+        }
+        Ok(())
+    }
+
+    fn act(&mut self, head: &Head, text: &str) -> Result<(), Problem> {
+        match head.kind.as_str() {
+            "view" => {
+                let view: View = read(text)?;
+                check_size(view.size).map_err(|e| Problem::field(&e))?;
+                self.edited &= !view.moving;
+                (self.size, self.view) = (view.size, view);
+                self.changed();
+            }
+            "scene" => {
+                let scene: Scene = read(text)?;
+                scene.quality.check().map_err(|e| Problem::field(&e))?;
+                if scene.tf != self.scene.tf || scene.crop != self.scene.crop {
+                    self.preview.scene_changed();
+                }
+                self.edited = scene.moving;
+                self.scene = scene;
+                self.changed();
+            }
+            "ack" => self.acknowledged(&read(text)?),
+            "ping" => {
+                let Ping { t } = read(text)?;
+                self.say(&json!({"type": "pong", "t": t}));
+            }
+            "open" => {
+                let Open { volume, scene, view } = read(text)?;
+                let then = First { view, scene };
+                self.open(Some(volume), false, head.id(), Some(then));
+            }
+            "watch" => {
+                let WatchAsk { of } = read(text)?;
+                self.watch(of);
+            }
+            _ => self.ask(head, text)?,
+        }
+        Ok(())
+    }
+
+    fn acknowledged(&mut self, ack: &Ack) {
+        let pair = Pair { seq: ack.seq, scene: ack.scene };
+        let pass = if ack.pass == "still" { Pass::Still } else { Pass::Moving };
+        if !self.slot.painted(pair, pass) {
+            return;
+        }
+        let now = Instant::now();
+        while let Some((of, kind, at)) = self.sent.pop_front() {
+            if (of, kind) == (pair, pass) {
+                if pass == Pass::Moving {
+                    let late_ms = (now - at).as_secs_f64() * 1e3;
+                    let since = self.painted_at.map_or(at, |painted| painted.max(at));
+                    self.preview.painted(late_ms, (now - since).as_secs_f64() * 1e3);
+                }
+                break;
+            }
+        }
+        self.painted_at = Some(now);
+    }
+
+    /// Begins and drops passes until there is nothing to do now. Returns for what to wait.
+    fn advance(&mut self) -> Step {
+        loop {
+            let Some(shown) = self.shown.clone().filter(|_| !self.opening) else {
+                return Step::Wait(None);
+            };
+            match self.slot.step(self.preview.is_slow(), self.shared.now()) {
+                Step::Drop => self.drop_pass(),
+                Step::Begin(pair, pass) => self.begin_pass(&shown, pair, pass),
+                wait @ Step::Wait(_) => return wait,
+            }
+        }
+    }
+
+    fn drop_pass(&mut self) {
+        if let Some(drawing) = self.drawing.take() {
+            drawing.task.abort();
+            self.slot.dropped(self.shared.now());
+        }
+    }
+
+    fn begin_pass(&mut self, shown: &Arc<Shown>, pair: Pair, pass: Pass) {
+        let rung = if pass == Pass::Moving { self.preview.choose().0 } else { 0 };
+        let edited = self.edited && pass == Pass::Moving;
+        let request = request_of(shown, &self.view, &self.scene, rung, edited);
+        let known = self.frame.as_ref().filter(|(of, _)| *of == request);
+        let frame = known.map(|(_, frame)| frame.clone());
+        self.passes += 1;
+        let number = self.passes;
+        let order =
+            Order { pair, pass, rung, request: request.clone(), codecs: self.codecs, frame };
+        let (shared, id, viewer, asked_at) =
+            (self.shared.clone(), self.id, self.viewer, self.asked_at);
+        let task = self.tasks.spawn(async move {
+            let result = picture::draw(shared, order, id, viewer, asked_at).await;
+            Outcome::Drawn { number, result: result.map(Box::new) }
+        });
+        self.slot.begun(pair, pass);
+        self.drawing = Some(Drawing { number, pair, pass, rung, request, task });
+    }
+
+    fn drawn(&mut self, number: u64, result: Result<Box<Drawn>, Problem>) {
+        let Some(drawing) = self.drawing.take_if(|drawing| drawing.number == number) else {
+            return;
+        };
+        let Drawing { pair, pass, rung, request, .. } = drawing;
+        let Drawn { frame, encoded, mut done, draw_ms } = match result {
+            Ok(drawn) => *drawn,
+            Err(problem) => {
+                self.slot.failed();
+                self.refuse(&problem, "scene", pair.scene.into());
+                return;
+            }
+        };
+        if let Some(object) = done.as_object_mut() {
+            object.remove("rung");
+        }
+        if let Some(ms) = draw_ms {
+            self.preview.drawn(rung, ms);
+        }
+        if rung == 0 {
+            self.frame = Some((request, frame));
+        }
+        let tiles = encoded.tiles.into_iter().map(Message::Binary);
+        let whole = tiles.chain([text(&done)]);
+        let of = Some((pair, pass));
+        self.queue.extend(whole.map(|message| Queued { message, pass: of }));
+        self.slot.delivered();
+        self.sent.push_back((pair, pass, Instant::now()));
+    }
+}
+
+/// Reads a message.
+pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, Problem> {
+    serde_json::from_str(text).map_err(|e| Problem::json(&e))
+}
+
+/// Opens a volume and describes it, on a blocking thread.
+pub(super) async fn opened(
+    shared: &Arc<Shared>,
+    choice: VolumeChoice,
+    viewer: Viewer,
+    size: [u32; 2],
+) -> Result<Shown, Problem> {
+    let home = shared.config.home.clone();
+    let described = shared.handle.reading(move |library| {
+        let open = library.open(&choice, viewer)?;
+        let name = library.name_of(open.served.info.digest, viewer);
+        describe(&open, name, size, &home)
+    });
+    described.await.ok_or_else(Problem::ending)?
+}

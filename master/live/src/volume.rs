@@ -95,6 +95,25 @@ fn presets_of(info: &VolumeInfo) -> Vec<Value> {
     fitted.collect()
 }
 
+/// Returns a choice's function in full.
+///
+/// # Errors
+/// There is no such preset, or the function is wrong in itself.
+pub(crate) fn function(
+    choice: &TransferChoice,
+    info: &VolumeInfo,
+) -> Result<TransferFunction, Problem> {
+    match choice {
+        TransferChoice::Name(name) => {
+            presets::by_name(name, &info.summary).map_err(|e| Problem::field(&e))
+        }
+        TransferChoice::Function(tf) => {
+            tf.check().map_err(|e| Problem::field(&e))?;
+            Ok((**tf).clone())
+        }
+    }
+}
+
 /// Returns target and height for which what a function shows fills the picture; `None` if it shows
 /// nothing.
 ///

@@ -22,8 +22,6 @@ const HOME_AZIMUTH: f64 = 20.0;
 #[derive(Clone)]
 pub(crate) struct Shown {
     pub(crate) served: Arc<ServedVolume>,
-    /// Name as the client may know it.
-    pub(crate) name: String,
     /// Whether stills are drawn at the level that fits: a file too large for memory.
     pub(crate) is_large: bool,
     pub(crate) home: Key,
@@ -204,7 +202,6 @@ pub(crate) fn describe(
     });
     Ok(Shown {
         served: served.clone(),
-        name,
         is_large: open.source.whole(open.level).is_none(),
         home: camera,
         home_tf: TransferChoice::Name(preset.into()),

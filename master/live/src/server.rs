@@ -8,7 +8,7 @@ use crate::files::Files;
 use crate::http;
 use crate::problem::Problem;
 use crate::session;
-use crate::shared::{LiveConfig, Shared};
+use crate::shared::{LiveConfig, SESSIONS, Shared};
 use axum::body::{Body, to_bytes};
 use axum::extract::FromRequestParts;
 use axum::extract::ws::WebSocketUpgrade;
@@ -81,6 +81,9 @@ pub async fn serve(
     }
     let ended = async { while open.join_next().await.is_some() {} };
     let _ = tokio::time::timeout(GOODBYE, ended).await;
+    // Sessions say goodbye.
+    let all = shared.sessions.acquire_many(SESSIONS as u32);
+    let _ = tokio::time::timeout(GOODBYE, all).await;
 }
 
 /// Answers the requests of one connection.

@@ -474,6 +474,47 @@ async fn tokens_are_asked_for_in_the_first_message_and_in_calls() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn live_pictures_come_beside_a_job_which_goes_on() {
+    let page = view(&["--tf", "skin"]);
+    let mut session = page.session(json!({"watch": ["jobs"]})).await;
+    session.still(0).await;
+    let movie = json!({"version": 1, "volume": {"name": VOLUME}, "tf": "fog", "format": "zip",
+        "fps": 10, "path": {"version": 1, "size": [256, 256],
+        "turntable": {"start": 0, "step": 1, "frames": 300}}});
+    let (status, answer) = page.post("/v1/movie", &movie);
+    assert_eq!(status, 202, "{answer}");
+    let mut begun = 0;
+    while begun < 3 {
+        let news = session.until("jobs").await;
+        let entries = news["changed"].as_array().expect("entries");
+        assert!(
+            entries.iter().all(|entry| entry["job"] == answer["job"]),
+            "live jobs are nobody's"
+        );
+        begun = entries.first().and_then(|job| job["frames_done"].as_u64()).unwrap_or(begun);
+    }
+    let began = Instant::now();
+    for seq in 1..=20u64 {
+        let camera = camera(seq as f64 * 7.0);
+        session.send(json!({"type": "view", "seq": seq, "camera": camera, "size": SIZE})).await;
+        session.still(seq).await;
+    }
+    let live = began.elapsed();
+    // The job is not over: else the pictures came behind it.
+    let last = loop {
+        let news = session.until("jobs").await;
+        if let Some(job) = news["changed"].as_array().and_then(|jobs| jobs.first()) {
+            break job.clone();
+        }
+    };
+    assert_eq!((&last["state"], &last["frames_total"]), (&json!("running"), &json!(300)), "{last}");
+    assert!(last["frames_done"].as_u64().is_some_and(|n| n > begun), "it goes on: {last}");
+    assert!(live < PATIENCE / 2, "20 pictures took {live:?} beside a job");
+    session.send(json!({"type": "cancel_job", "id": 5, "job": answer["job"]})).await;
+    assert_eq!(session.until("ok").await["id"], 5);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn page_comes_back_to_a_master_that_was_restarted() {
     let page = view(&[]);
     let port = page.port;

@@ -48,6 +48,9 @@ const WRITING: usize = 4;
 /// Messages of any kind that wait in the session's queue before it is given up.
 const MOST_QUEUED: usize = 4096;
 
+/// Messages that wait to be written beyond which no news is looked for.
+const NEWS_WAITING: usize = 8;
+
 /// Requests of a page that are answered at a time, its pictures included.
 const MOST_TASKS: usize = 32;
 
@@ -499,7 +502,9 @@ impl Session {
 
     /// Has the present state of what is watched looked at, unless that is under way.
     fn ask_news(&mut self) {
-        if self.news_asked {
+        // A client that reads slowly gets the state of the moment at which it has read.
+        let waiting = self.queue.iter().filter(|queued| queued.pass.is_none()).count();
+        if self.news_asked || waiting > NEWS_WAITING {
             return;
         }
         self.news_asked = true;

@@ -57,6 +57,7 @@ export class Viewer {
     this.hashed = null;
     core.wire.on("tile", (t) => { if (!t.thumb) this.tile(t); });
     core.wire.on("done", (m) => this.done(m));
+    core.on("volume", () => { this.pass = null; this.hashed = null; });
     core.wire.on("status", (s) => { if (s.state !== "live") this.pass = null; });
     new ResizeObserver(() => this.measure()).observe(stage);
     this.measure();

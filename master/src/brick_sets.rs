@@ -13,9 +13,11 @@ use slabcast_schedule::Micros;
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
 
-/// Most brick sets side by side: a change of transfer function and back costs nothing then. More
-/// would only fill the master's memory.
-const KEPT: usize = 3;
+/// Most brick sets side by side: a change of transfer function and back costs nothing then. A live
+/// session has four: all detail and a coarser level for moving, each with all voxels too while its
+/// transfer function is edited. With 3 it cut its own sets anew at each rest; more than this would
+/// only fill the master's memory.
+const KEPT: usize = 8;
 
 /// Microseconds that a set stays at least while a job needs it. Cutting mri256 takes 0.1 s: at half
 /// of this, a tenth of the time of four jobs with four functions goes into cutting.
@@ -179,13 +181,13 @@ mod tests {
 
     #[test]
     fn set_of_a_frame_in_flight_and_a_fresh_set_that_is_needed_stay() {
-        let stores: Vec<_> = (0..4u8).map(set).collect();
+        let stores: Vec<_> = (0..=KEPT as u8).map(set).collect();
         let mut sets = BrickSets::new(u64::MAX);
         for store in &stores[..KEPT] {
             assert!(sets.begin_cut(store.key(), 1, 0, |_| false, |_| true));
             sets.cut(store.clone(), 0);
         }
-        let key = stores[3].key();
+        let key = stores[KEPT].key();
         assert!(!sets.begin_cut(key, 1, STAYS - 1, |_| false, |_| true), "all are fresh");
         assert!(!sets.begin_cut(key, 1, STAYS, |_| true, |_| true), "all are drawn from");
         let first = stores[0].key();

@@ -16,7 +16,7 @@ use crate::brick_sets::BrickSets;
 use crate::finish::Assembly;
 use crate::finishers::Finishers;
 use crate::hooks::Hooks;
-use crate::jobs::active::ActiveJobs;
+use crate::jobs::active::{ActiveJobs, Submitter};
 use crate::jobs::submit::{Plan, SubmitError};
 use crate::jobs::{FinishedFrame, JobState, Jobs};
 use crate::library::Library;
@@ -31,7 +31,6 @@ use slabcast_proto::model::Worker;
 use slabcast_schedule::{Clock, Event as Happened, Micros};
 use slabcast_volumes::BrickStore;
 use std::collections::BTreeMap;
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
@@ -54,8 +53,8 @@ pub(crate) enum Event {
     /// A client's request was checked.
     Submit {
         plan: Box<Plan>,
-        peer: Option<IpAddr>,
-        reply: oneshot::Sender<Result<JobId, SubmitError>>,
+        submitter: Submitter,
+        reply: oneshot::Sender<Result<Admitted, SubmitError>>,
     },
     /// A brick set was cut.
     BricksCut { set: BrickSetKey, store: Result<Arc<BrickStore>, String> },
@@ -69,10 +68,41 @@ pub(crate) enum Event {
     FinishFailed { frame: FrameId, reason: String },
     /// A client cancels a job.
     Cancel { job: JobId, reply: oneshot::Sender<bool> },
+    /// Nobody wants a job's frames any more, nor to hear of it.
+    Forget { job: JobId },
     /// Somebody asks for the workers.
     Workers { reply: oneshot::Sender<Vec<Worker>> },
     /// The master ends.
     Shutdown,
+}
+
+/// A job that was taken.
+pub(crate) struct Admitted {
+    pub(crate) job: JobId,
+    /// Of a live session's job: ends it when whoever asked is gone, at whatever moment.
+    pub(crate) guard: Option<Forgets>,
+}
+
+/// Has the driver forget a job when it is dropped.
+pub(crate) struct Forgets {
+    job: JobId,
+    inbox: mpsc::Sender<Event>,
+}
+
+impl Drop for Forgets {
+    fn drop(&mut self) {
+        let event = Event::Forget { job: self.job };
+        let Err(mpsc::error::TrySendError::Full(event)) = self.inbox.try_send(event) else {
+            return;
+        };
+        // The driver is busy; it is told as soon as it has room.
+        let inbox = self.inbox.clone();
+        if let Ok(runtime) = tokio::runtime::Handle::try_current() {
+            runtime.spawn(async move {
+                let _ = inbox.send(event).await;
+            });
+        }
+    }
 }
 
 struct RealClock(Instant);
@@ -253,8 +283,14 @@ impl Driver {
                     self.refresh_states();
                 }
             }
-            Event::Submit { plan, peer, reply } => {
-                let _ = reply.send(self.submit(*plan, peer));
+            Event::Submit { plan, submitter, reply } => {
+                let admitted = self.submit(*plan, submitter).map(|job| {
+                    let inbox = self.inbox.clone();
+                    let guard = submitter.is_live().then(|| Forgets { job, inbox });
+                    Admitted { job, guard }
+                });
+                // Of a client that is gone a live job is forgotten.
+                let _ = reply.send(admitted);
             }
             Event::BricksCut { set, store } => self.bricks_cut(set, store),
             Event::BricksLost { worker, set, bricks, reason } => {
@@ -270,6 +306,12 @@ impl Driver {
                     self.end_job(job, JobState::Cancelled);
                 }
                 let _ = reply.send(is_active);
+            }
+            Event::Forget { job } => {
+                if self.active.contains(job) {
+                    self.end_job(job, JobState::Cancelled);
+                }
+                self.jobs.lock().forget(job);
             }
             Event::Workers { reply } => {
                 let seen = self.scheduler.workers().into_iter();

@@ -1,11 +1,12 @@
 //! Starting a master, and the handle by which links, services and embedding programs speak to it.
 
 use crate::admission::{AttachError, Audits, WorkerTable};
-use crate::driver::{Driver, Event};
+use crate::driver::{Admitted, Driver, Event, Forgets};
 use crate::finishers::Finishers;
 use crate::hooks::{Hooks, Stage};
+use crate::jobs::active::Submitter;
 use crate::jobs::submit::{Plan, SubmitError, check_key};
-use crate::jobs::{JobView, Jobs, Watch};
+use crate::jobs::{FinishedFrame, JobState, JobView, Jobs, Watch, WatchItem};
 use crate::library::{Library, Viewer, VolumeError};
 use crate::link::{Caller, WorkerLink};
 use crate::memory::Shares;
@@ -184,13 +185,13 @@ impl Handle {
     }
 
     /// Returns who calls from `peer`, as the library knows callers.
-    pub(crate) fn viewer(&self, peer: Option<IpAddr>) -> Viewer {
+    pub fn viewer(&self, peer: Option<IpAddr>) -> Viewer {
         Viewer::at(peer, self.show_names)
     }
 
     /// Runs what may read a volume's file, on a blocking thread; at most [`PLANS_AT_ONCE`] run at a
     /// time. `None` if the master is gone.
-    pub(crate) async fn reading<T: Send + 'static>(
+    pub async fn reading<T: Send + 'static>(
         &self,
         run: impl FnOnce(&Library) -> T + Send + 'static,
     ) -> Option<T> {
@@ -199,7 +200,7 @@ impl Handle {
 
     /// Runs a call that looks at folders or writes a piece of an upload on a blocking thread; at
     /// most [`LOOKS_AT_ONCE`] run at a time. `None` if the master has ended.
-    pub(crate) async fn looking<T: Send + 'static>(
+    pub async fn looking<T: Send + 'static>(
         &self,
         run: impl FnOnce(&Library) -> T + Send + 'static,
     ) -> Option<T> {
@@ -221,7 +222,7 @@ impl Handle {
     }
 
     /// Returns whether a job in progress draws the volume with this digest.
-    pub(crate) fn is_drawn(&self, volume: Digest32) -> bool {
+    pub fn is_drawn(&self, volume: Digest32) -> bool {
         let table = self.jobs.lock();
         table.jobs().any(|job| job.view.volume == volume && !job.view.state.is_over())
     }
@@ -254,19 +255,47 @@ impl Handle {
         request: PathRequest,
         peer: Option<IpAddr>,
     ) -> Result<JobId, SubmitError> {
-        let peer = peer.map(counted_as);
+        let submitter = Submitter::Batch(peer.map(counted_as));
+        self.submit_for(request, submitter, self.viewer(peer)).await.map(|admitted| admitted.job)
+    }
+
+    /// Submits a path of one frame for a live session, which is a number that no other session has.
+    /// `viewer` decides which volumes it may name. Jobs of sessions are listed nowhere; dropping
+    /// what is returned ends the job.
+    ///
+    /// # Errors
+    /// As [`Handle::submit`].
+    pub async fn draw(
+        &self,
+        request: PathRequest,
+        session: u64,
+        viewer: Viewer,
+    ) -> Result<Drawing, SubmitError> {
+        let Admitted { job, guard } =
+            self.submit_for(request, Submitter::Live(session), viewer).await?;
+        let watch = Watch::new(self.jobs.clone(), job, 0, self.inbox.clone());
+        Ok(Drawing { watch, _guard: guard })
+    }
+
+    async fn submit_for(
+        &self,
+        request: PathRequest,
+        submitter: Submitter,
+        viewer: Viewer,
+    ) -> Result<Admitted, SubmitError> {
+        let peer = submitter.peer();
         check_key(&request.client_key)?;
         if let Some(job) = self.jobs.lock().by_key(&request.client_key) {
             if *job.request != request {
                 return Err(SubmitError::KeyTaken);
             }
             if !job.may_retry() {
-                return Ok(job.view.id);
+                return Ok(Admitted { job: job.view.id, guard: None });
             }
         }
         // Whom the driver would turn away costs no check.
         let _checking = self.jobs.reserve(request.held_bytes(), peer, self.peer_limits.jobs)?;
-        let (viewer, shares, hooks) = (self.viewer(peer), self.shares, self.hooks.clone());
+        let (shares, hooks) = (self.shares, self.hooks.clone());
         let planned = self.reading(move |library| {
             caught("checking the request", || {
                 hooks.reach(Stage::Plan);
@@ -281,7 +310,7 @@ impl Handle {
         let plan = planned.await.ok_or(SubmitError::Gone)?;
         let plan = Box::new(plan.map_err(|e| SubmitError::Panicked(e.to_string()))??);
         let (reply, answer) = oneshot::channel();
-        if self.inbox.send(Event::Submit { plan, peer, reply }).await.is_err() {
+        if self.inbox.send(Event::Submit { plan, submitter, reply }).await.is_err() {
             return Err(SubmitError::Gone);
         }
         answer.await.map_err(|_| SubmitError::Gone)?
@@ -303,9 +332,15 @@ impl Handle {
         self.jobs.lock().get(job)?.first_kept(frame)
     }
 
-    /// Returns all jobs that are remembered, oldest first.
+    /// Returns the first frame of a job that is kept, without taking it.
+    pub fn kept_frame(&self, job: JobId) -> Option<Arc<FinishedFrame>> {
+        self.jobs.lock().get(job)?.kept_frame()
+    }
+
+    /// Returns all jobs that are remembered but for those of live sessions, oldest first.
     pub fn jobs(&self) -> Vec<JobView> {
-        self.jobs.lock().jobs().map(|job| job.view.clone()).collect()
+        let table = self.jobs.lock();
+        table.jobs().filter(|job| !job.submitter.is_live()).map(|job| job.view.clone()).collect()
     }
 
     /// Cancels a job. Returns false if there is none or its frames are no longer rendered.
@@ -360,6 +395,35 @@ impl Handle {
     /// fault, so that no tile is suspected of it.
     pub async fn detach(&self, worker: WorkerId, reason: String, is_damage: bool) {
         let _ = self.inbox.send(Event::Detached { worker, reason, is_damage }).await;
+    }
+}
+
+/// A picture that is being drawn for a live session, from [`Handle::draw`]. Dropped, it is drawn no
+/// further.
+pub struct Drawing {
+    // Dropped first: the watcher tells the table that it holds no frame.
+    watch: Watch,
+    _guard: Option<Forgets>,
+}
+
+impl Drawing {
+    /// Waits for the picture.
+    ///
+    /// # Errors
+    /// It can't be drawn, for a reason in words.
+    pub async fn finished(&mut self) -> Result<Arc<FinishedFrame>, String> {
+        loop {
+            match self.watch.next().await {
+                Some(WatchItem::Frame(frame)) => return Ok(frame),
+                Some(WatchItem::Failed { reason, .. }) => return Err(reason.to_string()),
+                Some(WatchItem::Notice(view)) => match view.state {
+                    JobState::Failed(reason) => return Err(reason),
+                    JobState::Cancelled => return Err("it was cancelled".into()),
+                    _ => {}
+                },
+                None => return Err("the master ended".into()),
+            }
+        }
     }
 }
 

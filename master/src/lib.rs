@@ -62,7 +62,7 @@ pub mod record;
 pub mod serve;
 
 pub use admission::AttachError;
-pub use handle::{Handle, Master, MasterConfig};
+pub use handle::{Drawing, Handle, Master, MasterConfig};
 pub use jobs::submit::SubmitError;
 pub use library::{Library, LibraryConfig, ServedVolume};
 pub use serve::PeerLimits;

@@ -3,7 +3,7 @@
 use crate::lab::{self, LabArgs, LabCommand};
 use crate::{
     cancel, compare, completions, config, convert, demo, doctor, help, info, jobs, logging, man,
-    master, read_dicom, read_hdf5, render, rerender, status, tf, volumes, worker,
+    master, read_dicom, read_hdf5, render, rerender, status, tf, view, volumes, worker,
 };
 use clap::{Arg, Command, CommandFactory, Parser, Subcommand};
 use std::fmt::Write;
@@ -39,6 +39,7 @@ pub(crate) struct Cli {
 #[derive(Subcommand, Debug)]
 pub(crate) enum Commands {
     Render(Box<render::RenderArgs>),
+    View(Box<view::ViewArgs>),
     Compare(Box<compare::CompareArgs>),
     Rerender(rerender::RerenderArgs),
     Info(info::InfoArgs),
@@ -70,19 +71,20 @@ pub(crate) enum Commands {
 
 /// Groups of the help and their commands, in its order.
 pub(crate) const GROUPS: [(&str, &[&str]); 4] = [
-    ("Pictures", &["render", "compare", "rerender", "info", "convert", "tf", "demo"]),
+    ("Pictures", &["render", "view", "compare", "rerender", "info", "convert", "tf", "demo"]),
     ("Cluster", &["master", "worker", "status", "jobs", "cancel", "volumes", "put", "rm"]),
     ("Laboratory", &["lab"]),
     ("Setup", &["config", "doctor", "completions", "man", "help"]),
 ];
 
 /// Commands that the short help only names: it has to fit a screen of 24 lines.
-const ALSO: [&str; 6] = ["volumes", "put", "rm", "completions", "man", "help"];
+const ALSO: [&str; 8] = ["rerender", "tf", "volumes", "put", "rm", "completions", "man", "help"];
 
 const EXAMPLES: &str = "\
 Examples:
   slabcast demo                                  pictures without any file
   slabcast render brain.nii.gz                   36 pictures of a full turn, in slabcast-out/
+  slabcast view brain.nii.gz --open              turn and colour it in a browser
   slabcast info brain.nii.gz                     what is in the file
   slabcast master --volumes scans/               a cluster: a master,
   slabcast worker --master 127.0.0.1:7433        workers, here or elsewhere,

@@ -26,6 +26,8 @@ mod man;
 mod master;
 mod master_client;
 mod orient;
+mod page;
+mod page_files;
 mod read_dicom;
 mod read_hdf5;
 mod render;
@@ -34,6 +36,7 @@ mod status;
 mod systemd;
 mod tf;
 mod usage;
+mod view;
 mod volumes;
 mod worker;
 
@@ -66,6 +69,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
     match &cli.command {
         Commands::Render(args) => render::run(args),
         Commands::Rerender(args) => rerender::run(args),
+        Commands::View(args) => view::run(args),
         Commands::Compare(args) => compare::run(args),
         Commands::Info(args) => info::run(args),
         Commands::Convert(args) => convert::run(args),

@@ -4,7 +4,9 @@
 //! ten seconds and ends with 0. Every flag has a variable of the environment ([`crate::config`]),
 //! so that a unit file needs none.
 
+use crate::page::{self, PageArgs};
 use crate::systemd::{self, DRAIN};
+use slabcast_live::Home;
 use slabcast_master::library::{ReadFile, Source, Unreadable, UploadConfig, Viewer};
 use slabcast_master::memory::{Shares, available};
 use slabcast_master::{Library, LibraryConfig, MasterConfig, PeerLimits};
@@ -101,6 +103,8 @@ pub(crate) struct MasterArgs {
     /// Tell clients on other machines the names of volumes, which may be patients'
     #[arg(long, value_parser = clap::builder::FalseyValueParser::new())]
     show_names: bool,
+    #[command(flatten)]
+    page: PageArgs,
     /// Events and decisions of the scheduler, for `slabcast lab replay`; some 25 KB a frame
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
@@ -126,6 +130,7 @@ pub(crate) struct MasterArgs {
 pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
     let axes = AxisArgs { up: args.up, front: args.front };
     axes.orientation()?;
+    let page_config = args.page.config(Home::default())?;
     let runtime = runtime::start()?;
     // The address is taken before the volume is read, so that a port in use is told at once;
     // it is opened after, so that whoever gets through gets an answer.
@@ -180,14 +185,14 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
         let handle = master.handle();
         signals::listen();
         let (stop, stopped) = watch::channel(false);
-        let mut served =
-            tokio::spawn(slabcast_master::serve::serve(handle.clone(), listener, stopped));
+        let url = page::url(address, &page_config);
+        let mut served = page::serve(handle.clone(), listener, page_config, &stopped);
         if args.insecure && !address.ip().is_loopback() {
             warn!("--insecure: whoever reaches {address} may read the volume and submit jobs");
         }
         info!(%address, volumes, volume = name, ?dims, "listening");
         // Nobody may read stdout (systemd closes it): that is no reason to end.
-        let _ = say(&format!("listening on {address}\n"));
+        let _ = say(&format!("listening on {address}\npage {url}\n"));
         systemd::ready(&format!("serving {name} on {address}"));
         let beat = tokio::spawn(systemd::watchdog(Some(handle)));
         let result = tokio::select! {
@@ -245,24 +250,7 @@ impl MasterArgs {
 /// Returns the volumes of the master: the one that was `given`, those of folders, and those of clients.
 fn library(args: &MasterArgs, given: Option<Source>, port: u16) -> Result<Library, Fail> {
     let axes = AxisArgs { up: args.up, front: args.front };
-    let input = args.input.clone();
-    let read: ReadFile = Arc::new(move |path, most_bytes| {
-        let opened = input.read(path, most_bytes);
-        // Clients are told the file's name, not its folder.
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let (OpenedSource { source, .. }, notes) = opened.map_err(|e| {
-            let is_too_large = e.problem.kind == OpenErrorKind::TooLarge;
-            Unreadable { reason: OpenError { file: name, ..e }.to_string(), is_too_large }
-        })?;
-        for note in notes {
-            info!(volume = source.name(), "{note}");
-        }
-        let orientation = axes.for_info(&source.levels()[0]).map_err(|e| {
-            let reason = e.line().unwrap_or_default().to_owned();
-            Unreadable { reason, is_too_large: false }
-        })?;
-        Ok((source, orientation))
-    });
+    let read = reader(args.input.clone(), axes);
     let folder = match &args.uploads {
         _ if args.upload_quota == 0 => None,
         Some(folder) => Some(folder.clone()),
@@ -285,6 +273,27 @@ fn library(args: &MasterArgs, given: Option<Source>, port: u16) -> Result<Librar
         Err(e) if e.starts_with("--uploads") => Err(Fail::failed(e)),
         Err(e) => Err(Fail::failed(format!("--volumes {e}"))),
     }
+}
+
+/// Returns the reader of files of folders and pages: what `input` says of files holds for each.
+pub(crate) fn reader(input: volume::InputArgs, axes: AxisArgs) -> ReadFile {
+    Arc::new(move |path, most_bytes| {
+        let opened = input.read(path, most_bytes);
+        // Clients are told the file's name, not its folder.
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let (OpenedSource { source, .. }, notes) = opened.map_err(|e| {
+            let is_too_large = e.problem.kind == OpenErrorKind::TooLarge;
+            Unreadable { reason: OpenError { file: name, ..e }.to_string(), is_too_large }
+        })?;
+        for note in notes {
+            info!(volume = source.name(), "{note}");
+        }
+        let orientation = axes.for_info(&source.levels()[0]).map_err(|e| {
+            let reason = e.line().unwrap_or_default().to_owned();
+            Unreadable { reason, is_too_large: false }
+        })?;
+        Ok((source, orientation))
+    })
 }
 
 /// Returns where volumes of clients go by default: a folder for each port, so that two masters of one
@@ -341,7 +350,7 @@ fn raise_files() {
 fn raise_files() {}
 
 /// Takes the address without opening it. Refuses what others can reach, unless `insecure`.
-async fn bind(text: &str, insecure: bool) -> Result<TcpSocket, Fail> {
+pub(crate) async fn bind(text: &str, insecure: bool) -> Result<TcpSocket, Fail> {
     let found = tokio::net::lookup_host(text).await.map_err(|e| {
         Fail::failed(format!("--listen {text}: looking up the host failed: {}", reason(&e)))
     })?;
@@ -367,7 +376,8 @@ async fn bind(text: &str, insecure: bool) -> Result<TcpSocket, Fail> {
     taken.map_err(|e| cannot_listen(text, &e))
 }
 
-fn listen(socket: TcpSocket, text: &str) -> Result<TcpListener, Fail> {
+/// Opens an address that was taken.
+pub(crate) fn listen(socket: TcpSocket, text: &str) -> Result<TcpListener, Fail> {
     socket.listen(1024).map_err(|e| cannot_listen(text, &e))
 }
 
@@ -390,6 +400,7 @@ fn cannot_listen(text: &str, e: &std::io::Error) -> Fail {
     })
 }
 
-fn local(listener: &TcpListener) -> Result<SocketAddr, Fail> {
+/// Returns the address that a listener has.
+pub(crate) fn local(listener: &TcpListener) -> Result<SocketAddr, Fail> {
     listener.local_addr().map_err(|e| Fail::failed(format!("listening failed: {}", reason(&e))))
 }

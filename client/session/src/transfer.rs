@@ -11,6 +11,8 @@ use slabcast_common::volume::VolumeInfo;
 use slabcast_scene::paraview;
 use slabcast_scene::presets;
 use slabcast_scene::transfer::TransferChoice;
+pub use slabcast_scene::values::in_values;
+use slabcast_scene::values::printed_preset;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -235,38 +237,6 @@ impl Transfer {
             _ => self.base.clone(),
         }
     }
-}
-
-/// Returns a function over shares of a volume's range as one over its values, for people to change.
-///
-/// Points are off by what a rounding of the last digit makes of them. [`Transfer::function`] knows
-/// a preset that was not changed by its numbers, and draws it to the bit.
-pub fn in_values(tf: &TransferFunction, info: &VolumeInfo) -> TransferFunction {
-    if tf.domain == Domain::Value {
-        return tf.clone();
-    }
-    let (lo, hi) = info.summary.range();
-    let x = |x: f64| lo + x * (hi - lo);
-    // Shares of the range over one vox become values over a unit of length.
-    let slope = (hi - lo) / info.lattice.vox();
-    TransferFunction {
-        domain: Domain::Value,
-        colors: tf.colors.iter().map(|c| [x(c[0]), c[1], c[2], c[3]]).collect(),
-        opacities: tf.opacities.iter().map(|o| [x(o[0]), o[1]]).collect(),
-        gradient_opacity: tf.gradient_opacity.iter().map(|g| [g[0] * slope, g[1]]).collect(),
-        ..tf.clone()
-    }
-}
-
-/// Returns the preset that gives exactly the numbers of a function from a file, in this volume's
-/// values; `None` if no preset does.
-fn printed_preset(tf: &TransferFunction, info: &VolumeInfo) -> Option<TransferFunction> {
-    if tf.domain != Domain::Value {
-        return None;
-    }
-    let names = presets::NAMES.iter().chain(&presets::MAPS);
-    let mut all = names.filter_map(|(name, _)| presets::by_name(name, &info.summary).ok());
-    all.find(|preset| in_values(preset, info) == *tf)
 }
 
 /// The x between which a function shows anything, within the volume's values.

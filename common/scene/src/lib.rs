@@ -33,6 +33,7 @@
 
 pub mod brick_needs;
 pub mod colour;
+pub mod document;
 pub mod levels;
 pub mod paraview;
 pub mod path;
@@ -40,3 +41,4 @@ pub mod presets;
 pub mod request;
 pub mod transfer;
 pub mod tween;
+pub mod values;

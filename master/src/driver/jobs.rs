@@ -2,17 +2,17 @@
 
 use super::Driver;
 use crate::jobs::JobState;
+use crate::jobs::active::Submitter;
 use crate::jobs::submit::{Plan, SubmitError};
 use slabcast_common::ids::{FrameId, JobId};
 use slabcast_schedule::Event as Happened;
-use std::net::IpAddr;
 use tracing::{info, warn};
 
 impl Driver {
     pub(super) fn submit(
         &mut self,
         plan: Plan,
-        peer: Option<IpAddr>,
+        submitter: Submitter,
     ) -> Result<JobId, SubmitError> {
         let mut table = self.jobs.lock();
         // Another request may have come under this key while this one was checked.
@@ -27,17 +27,20 @@ impl Driver {
             }
             return Ok(id);
         }
+        let peer = submitter.peer();
         table.has_place(plan.held_bytes(), peer)?;
         let id = table.next_id();
         let mut entry = plan.entry(id);
-        entry.peer = peer;
-        info!(
-            job = %id, peer = peer.map(|ip| ip.to_string()),
-            frames = entry.view.frames_total, sums = ?plan.quality().sums, "job submitted"
-        );
+        entry.submitter = submitter;
+        if !submitter.is_live() {
+            info!(
+                job = %id, peer = peer.map(|ip| ip.to_string()),
+                frames = entry.view.frames_total, sums = ?plan.quality().sums, "job submitted"
+            );
+        }
         table.insert(entry);
         drop(table);
-        self.activate(id, plan, peer, 0);
+        self.activate(id, plan, submitter, 0);
         Ok(id)
     }
 
@@ -48,22 +51,22 @@ impl Driver {
         if self.active.contains(id) {
             self.refresh_states();
         } else {
-            let peer = self.jobs.lock().get(id).and_then(|job| job.peer);
-            self.activate(id, plan, peer, u64::MAX);
+            let submitter = self.jobs.lock().get(id).map(|job| job.submitter);
+            self.activate(id, plan, submitter.unwrap_or(Submitter::Batch(None)), u64::MAX);
         }
         self.jobs.ring();
     }
 
     /// Makes a job active: its frames from number `next` on are drawn, and those that are wanted
     /// again.
-    fn activate(&mut self, id: JobId, plan: Plan, peer: Option<IpAddr>, next: u64) {
+    fn activate(&mut self, id: JobId, plan: Plan, submitter: Submitter, next: u64) {
         let bricks = match self.brick_sets.covering(plan.volume(), &plan.wanted) {
             Some(store) => store.needs().clone(),
             None => plan.wanted.clone(),
         };
         let mut job = plan.activate(id, bricks);
         job.next = next.min(job.views.len());
-        self.active.insert(id, job, peer);
+        self.active.insert(id, job, submitter);
         self.refresh_states();
     }
 

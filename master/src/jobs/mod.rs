@@ -21,6 +21,7 @@ pub use watcher::{Watch, WatchItem};
 
 use crate::handle::unix_ms;
 use crate::memory::mib;
+use active::Submitter;
 use bytes::Bytes;
 use numbers::Numbers;
 use slabcast_common::ids::JobId;
@@ -165,8 +166,8 @@ struct Kept {
 pub(crate) struct Job {
     pub(crate) view: JobView,
     pub(crate) request: Arc<PathRequest>,
-    /// The address that it was submitted from; `None`: this process.
-    pub(crate) peer: Option<IpAddr>,
+    /// Whom it is drawn for.
+    pub(crate) submitter: Submitter,
     /// Frames that are kept, by number.
     frames: BTreeMap<u64, Kept>,
     /// Numbers of frames that were finished at least once.
@@ -191,7 +192,7 @@ impl Job {
         Job {
             view,
             request,
-            peer: None,
+            submitter: Submitter::Batch(None),
             frames: BTreeMap::new(),
             ever_done: Numbers::default(),
             untaken: (0, 0),
@@ -217,6 +218,11 @@ impl Job {
     /// Returns the first frame from `number` on whose pixels are kept.
     pub(crate) fn first_kept(&self, number: u64) -> Option<u64> {
         self.frames.range(number..).next().map(|(number, _)| *number)
+    }
+
+    /// Returns the first frame that is kept.
+    pub(crate) fn kept_frame(&self) -> Option<Arc<FinishedFrame>> {
+        self.frames.values().next().map(|kept| kept.frame.clone())
     }
 
     /// Whether it is over and has failed frames that may be drawn again.
@@ -311,7 +317,7 @@ impl Table {
     /// [`SubmitError::Full`] with the figures.
     pub(crate) fn has_place(&self, bytes: usize, peer: Option<IpAddr>) -> Result<(), SubmitError> {
         let open = self.jobs.values().filter(|job| !job.view.state.is_over());
-        self.has_place_among(open.map(|job| (job.held_bytes, job.peer)), bytes, peer)
+        self.has_place_among(open.map(|job| (job.held_bytes, job.submitter.peer())), bytes, peer)
     }
 
     /// Checks that there is a place for a request of `bytes` from `peer` beside the requests `others`
@@ -374,11 +380,17 @@ impl Table {
             else {
                 return;
             };
-            if let Some(job) = self.jobs.remove(&id) {
-                self.by_key.remove(&job.view.client_key);
-                self.bytes -= job.frames.values().map(|f| f.bytes).sum::<usize>();
-                self.held_bytes -= job.held_bytes;
-            }
+            self.forget(id);
+        }
+    }
+
+    /// Forgets a job that is over.
+    pub(crate) fn forget(&mut self, id: JobId) {
+        if let Some(job) = self.jobs.remove(&id) {
+            self.by_key.remove(&job.view.client_key);
+            self.bytes -= job.frames.values().map(|f| f.bytes).sum::<usize>();
+            self.held_bytes -= job.held_bytes;
+            self.in_hand.retain(|(of, _), _| *of != id);
         }
     }
 
@@ -621,7 +633,7 @@ impl Jobs {
         let mut table = self.lock();
         let open = table.jobs.values().filter(|job| !job.view.state.is_over());
         let others: Vec<(usize, Option<IpAddr>)> = open
-            .map(|job| (job.held_bytes, job.peer))
+            .map(|job| (job.held_bytes, job.submitter.peer()))
             .chain(table.checking.iter().copied())
             .collect();
         let of_peer = others.iter().filter(|other| other.1 == peer).count();

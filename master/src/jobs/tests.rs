@@ -385,7 +385,7 @@ fn one_address_has_half_of_the_memory_for_requests() {
     // The last check counts the bytes of the request itself.
     let mut table = jobs.lock();
     let mut big = job(JobId(1), 1);
-    (big.peer, big.held_bytes) = (greedy, 32 << 20);
+    (big.submitter, big.held_bytes) = (Submitter::Batch(greedy), 32 << 20);
     table.insert(big);
     assert!(table.has_place(1, greedy).is_err() && table.has_place(1, other).is_ok());
 }

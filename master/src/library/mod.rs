@@ -9,6 +9,7 @@
 //! function here may read a file or wait for one: call it on a blocking thread, never on the
 //! driver's or the runtime's.
 
+mod import;
 mod levels;
 mod stored;
 #[cfg(test)]
@@ -154,7 +155,7 @@ impl Viewer {
 
     /// Returns the viewer at an address. A file's name may be a patient's, so others than this
     /// machine's callers are told names only if `show_names`.
-    pub(crate) fn at(address: Option<IpAddr>, show_names: bool) -> Viewer {
+    pub fn at(address: Option<IpAddr>, show_names: bool) -> Viewer {
         let is_here = address.is_none_or(|ip| ip.to_canonical().is_loopback());
         Viewer { address: address.map(counted_as), may_know_names: is_here || show_names }
     }
@@ -557,10 +558,7 @@ impl Library {
                 return Ok(Progress { received_bytes: total, done: true });
             }
             if entries.by_name.contains_key(&header.name) {
-                return Err(VolumeError::NameTaken(format!(
-                    "another volume is called `{}`; give another name, or remove that one",
-                    header.name
-                )));
+                return Err(name_taken(&header.name));
             }
             entries.uploaded_bytes()
         };
@@ -755,6 +753,11 @@ impl Entry {
     fn may_be_dropped(&self) -> bool {
         self.origin != VolumeOrigin::Given && self.source.is_some()
     }
+}
+
+fn name_taken(name: &str) -> VolumeError {
+    let why = format!("another volume is called `{name}`; give another name, or remove that one");
+    VolumeError::NameTaken(why)
 }
 
 fn no_such_digest(digest: Digest32) -> VolumeError {

@@ -2,7 +2,7 @@
 
 use super::peers::{Counts, PeerLimits, Place, Rarely};
 use std::io::ErrorKind;
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -22,7 +22,7 @@ const MAX_CONNECTIONS: usize = 4096;
 /// [`PeerLimits`] to be one.
 const KEPT_FOR_WORKERS: usize = 256;
 
-/// Time that a connection may take to send its HTTP/2 preface (24 bytes).
+/// Time that a connection may take to say what it speaks: 24 bytes of HTTP/2, or one of another.
 const PREFACE: Duration = Duration::from_secs(3);
 
 /// Time for which a connection that has been of use may have no call.
@@ -191,10 +191,72 @@ impl AsyncWrite for Connection {
     }
 }
 
-/// Accepts connections for ever and passes on those that sent their preface in time.
+/// A connection whose first bytes are no HTTP/2 preface, from [`super::serve_with_pages`]: a browser's,
+/// which speaks HTTP/1.1. It counts against the limits of connections while it lives.
+pub struct PageConnection {
+    io: TcpStream,
+    peer: SocketAddr,
+    _place: OwnedSemaphorePermit,
+    _share: Place,
+}
+
+impl PageConnection {
+    /// Address of the caller.
+    pub fn peer(&self) -> SocketAddr {
+        self.peer
+    }
+
+    /// Address of this machine that was called.
+    ///
+    /// # Errors
+    /// The connection is gone.
+    pub fn local(&self) -> std::io::Result<SocketAddr> {
+        self.io.local_addr()
+    }
+}
+
+impl AsyncRead for PageConnection {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        buf: &mut ReadBuf<'_>,
+    ) -> Poll<std::io::Result<()>> {
+        Pin::new(&mut self.io).poll_read(cx, buf)
+    }
+}
+
+impl AsyncWrite for PageConnection {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        buf: &[u8],
+    ) -> Poll<std::io::Result<usize>> {
+        Pin::new(&mut self.io).poll_write(cx, buf)
+    }
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        bufs: &[std::io::IoSlice<'_>],
+    ) -> Poll<std::io::Result<usize>> {
+        Pin::new(&mut self.io).poll_write_vectored(cx, bufs)
+    }
+    fn is_write_vectored(&self) -> bool {
+        self.io.is_write_vectored()
+    }
+    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<std::io::Result<()>> {
+        Pin::new(&mut self.io).poll_flush(cx)
+    }
+    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<std::io::Result<()>> {
+        Pin::new(&mut self.io).poll_shutdown(cx)
+    }
+}
+
+/// Accepts connections for ever and passes on those that said in time what they speak: HTTP/2 to
+/// `accepted`, all else to `pages`.
 pub(super) async fn accept(
     listener: TcpListener,
     accepted: mpsc::Sender<std::io::Result<Connection>>,
+    pages: Option<mpsc::Sender<PageConnection>>,
     limits: PeerLimits,
 ) {
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
@@ -228,11 +290,11 @@ pub(super) async fn accept(
             debug!(%from, error = %e, "connection lost at once");
             continue;
         }
-        let accepted = accepted.clone();
+        let (accepted, pages) = (accepted.clone(), pages.clone());
         let is_provisional = places.available_permits() < KEPT_FOR_WORKERS;
         tokio::spawn(async move {
-            match tokio::time::timeout(PREFACE, preface(&io)).await {
-                Ok(true) => {
+            match tokio::time::timeout(PREFACE, speaks(&io)).await {
+                Ok(Some(Speaks::Http2)) => {
                     let connection = Connection {
                         io,
                         state: Arc::new(State::new(is_provisional, patience)),
@@ -242,20 +304,39 @@ pub(super) async fn accept(
                     };
                     let _ = accepted.send(Ok(connection)).await;
                 }
-                Ok(false) => debug!(%from, "connection closed before its preface"),
+                Ok(Some(Speaks::Other)) => match pages {
+                    // The last places are kept for workers.
+                    Some(pages) if !is_provisional => {
+                        let connection =
+                            PageConnection { io, peer: from, _place: place, _share: share };
+                        let _ = pages.send(connection).await;
+                    }
+                    _ => debug!(%from, "connection closed: it does not speak HTTP/2"),
+                },
+                Ok(None) => debug!(%from, "connection closed before its preface"),
                 Err(_) => debug!(%from, "connection dropped: no preface in time"),
             }
         });
     }
 }
 
-/// Waits until the 24 bytes of the HTTP/2 preface can be read; false if the peer is gone.
-async fn preface(io: &TcpStream) -> bool {
+/// First bytes of an HTTP/2 connection.
+const PREFACE_BYTES: &[u8; 24] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
+
+/// What a connection speaks, by its first bytes.
+enum Speaks {
+    Http2,
+    Other,
+}
+
+/// Waits until the first bytes say what a connection speaks; `None` if the peer is gone.
+async fn speaks(io: &TcpStream) -> Option<Speaks> {
     let mut bytes = [0; 24];
     loop {
         match io.peek(&mut bytes).await {
-            Ok(24) => return true,
-            Ok(0) | Err(_) => return false,
+            Ok(0) | Err(_) => return None,
+            Ok(n) if bytes[..n] != PREFACE_BYTES[..n] => return Some(Speaks::Other),
+            Ok(24) => return Some(Speaks::Http2),
             // Readable, but not whole: `peek` would return at once again.
             Ok(_) => tokio::time::sleep(Duration::from_millis(20)).await,
         }

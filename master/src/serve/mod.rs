@@ -1,7 +1,7 @@
 //! gRPC: RenderService and ClusterService over TCP, with health and reflection.
 //!
 //! The accept loop is ours, since tonic's leaves a silent peer connected for ever: a
-//! connection has a few seconds to send its HTTP/2 preface and its first request, there is a limit
+//! connection has a few seconds to say what it speaks and to send its first request, there is a limit
 //! on how many there are and how many one address has, and each has TCP_NODELAY (without it a task
 //! costs 40 ms). Every call passes a gate.
 
@@ -12,8 +12,8 @@ mod peers;
 mod render;
 mod volumes;
 
-pub use peers::PeerLimits;
-pub(crate) use peers::counted_as;
+pub use connections::PageConnection;
+pub use peers::{PeerLimits, counted_as};
 pub use render::notice;
 
 use crate::Handle;
@@ -47,6 +47,20 @@ pub async fn serve(
     listener: TcpListener,
     stop: watch::Receiver<bool>,
 ) -> std::io::Result<()> {
+    serve_with_pages(handle, listener, stop, None).await
+}
+
+/// Serves `handle` like [`serve`], and passes connections that do not speak HTTP/2 to `pages`;
+/// without it they are closed.
+///
+/// # Errors
+/// Those of [`serve`].
+pub async fn serve_with_pages(
+    handle: Handle,
+    listener: TcpListener,
+    stop: watch::Receiver<bool>,
+    pages: Option<mpsc::Sender<PageConnection>>,
+) -> std::io::Result<()> {
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<RenderServiceServer<Render>>().await;
     health.set_serving::<ClusterServiceServer<Cluster>>().await;
@@ -61,7 +75,7 @@ pub async fn serve(
         .max_decoding_message_size(MAX_CONTROL_MESSAGE)
         .max_encoding_message_size(MAX_CONTROL_MESSAGE);
     let (accepted, incoming) = mpsc::channel::<std::io::Result<Connection>>(16);
-    let accepting = tokio::spawn(accept(listener, accepted, limits));
+    let accepting = tokio::spawn(accept(listener, accepted, pages, limits));
     let stopped = stopped(stop.clone());
     let server = tonic::transport::Server::builder()
         .initial_stream_window_size(1 << 20)

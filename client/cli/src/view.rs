@@ -1,0 +1,165 @@
+//! `slabcast view`: a page to look at a volume, turn, colour and cut it.
+//!
+//! A master and workers run inside this process, as `render` has them, and serve the page of every
+//! master on a port of this machine until Ctrl-C.
+
+use crate::master::{bind, listen, local, reader};
+use crate::page::{self, PageArgs};
+use slabcast_live::Home;
+use slabcast_master::library::{Source, UploadConfig};
+use slabcast_master::memory::available;
+use slabcast_master::{Library, LibraryConfig};
+use slabcast_scene::presets;
+use slabcast_session::embedded::{Cluster, SHARED, WorkerGroup};
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::progress;
+use slabcast_session::request::AxisArgs;
+use slabcast_session::transfer::NameOrFile;
+use slabcast_session::{parse, runtime, signals, volume};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use tokio::sync::watch;
+
+/// Bytes that files dropped on the page may take on disk.
+const UPLOADS: u64 = 16 << 30;
+
+/// Shows a volume in a web browser.
+///
+/// To turn, colour and cut it with the mouse, and to take pictures, movies and commands from there.
+#[derive(clap::Args, Clone, Debug)]
+#[command(after_help = "\
+Examples:
+  slabcast view brain.nii.gz --open
+  slabcast view ct.nrrd --tf bone
+  slabcast view head.raw --up=-y
+  On another machine, through a tunnel (ssh -L 7444:127.0.0.1:7444 node):
+      slabcast view ct.nrrd --listen 127.0.0.1:7444
+
+The page has the command that draws each of its pictures. A master serves the same page for all of
+its volumes, on its own port (see `slabcast master --help`).")]
+pub(crate) struct ViewArgs {
+    #[arg(help = volume::VOLUME)]
+    volume: PathBuf,
+    #[command(flatten)]
+    input: volume::InputArgs,
+    #[command(flatten)]
+    axes: AxisArgs,
+    /// Preset or colour map of the first picture
+    #[arg(long, value_name = "NAME", default_value = "auto", value_parser = NameOrFile::TRANSFER,
+          hide_possible_values = true)]
+    tf: String,
+    /// Open the page in this machine's browser
+    #[arg(long)]
+    open: bool,
+    /// Address of the page; port 0 takes any free one
+    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:0", value_parser = parse::listen)]
+    listen: String,
+    /// Listen beyond this machine although nothing is encrypted
+    #[arg(long, value_parser = clap::builder::FalseyValueParser::new(), hide_short_help = true)]
+    insecure: bool,
+    #[command(flatten)]
+    page: PageArgs,
+    /// Workers inside this process [default: 1]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64),
+          hide_short_help = true)]
+    workers: Option<u32>,
+    /// Render threads of each worker [default: all cores]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    threads: Option<u32>,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &ViewArgs) -> Result<(), Fail> {
+    args.axes.orientation()?;
+    let crew = WorkerGroup::new(args.workers.unwrap_or(1), args.threads)?;
+    let is_known = presets::NAMES.iter().chain(&presets::MAPS).any(|(name, _)| *name == args.tf);
+    if !is_known {
+        return Err(Fail::flag(&presets::unknown_name(&args.tf)));
+    }
+    let file = args.volume.to_string_lossy().into_owned();
+    let home = Home { tf: Some(args.tf.clone()), file: Some(file) };
+    let config = args.page.config(home)?;
+    let runtime = runtime::start()?;
+    // A port in use is told before a large file is read.
+    let socket = runtime.block_on(bind(&args.listen, args.insecure))?;
+    let opened = args.input.open_source(&args.volume)?;
+    let orientation = args.axes.for_info(opened.info())?;
+    // Workers share the master's bricks of a volume in memory; of a file both drop what exceeds
+    // their memory.
+    let brick_bytes = match opened.source.whole(0) {
+        Some(_) => SHARED,
+        None => available().map_or(SHARED, |free| free / 4 / u64::from(crew.workers)),
+    };
+    // Files that are dropped on the page live as long as the page.
+    let uploads = tempfile::Builder::new().prefix("slabcast-view-").tempdir();
+    let uploads = uploads.map_err(|e| Fail::failed(format!("making a folder failed: {e}")))?;
+    let result = runtime.block_on(async {
+        let listener = listen(socket, &args.listen)?;
+        let address = local(&listener)?;
+        let url = page::url(address, &config);
+        let library = library(args, (opened.source, orientation), uploads.path())?;
+        let mut cluster = Cluster::with_library(library, crew, brick_bytes, None)?;
+        signals::listen();
+        let (stop, stopped) = watch::channel(false);
+        let mut served = page::serve(cluster.handle(), listener, config, &stopped);
+        say(&format!("{url}\n"))?;
+        if args.open {
+            open(&url);
+        } else {
+            progress::note("open this address in a browser; Ctrl-C ends");
+        }
+        let ended = tokio::select! {
+            _ = signals::stopped() => Ok(()),
+            trouble = cluster.trouble() => Err(trouble),
+            ended = &mut served => Err(match ended {
+                Ok(Ok(())) => Fail::failed("serving the page stopped by itself"),
+                Ok(Err(e)) => Fail::failed(format!("serving the page failed: {e}")),
+                Err(e) => Fail::failed(format!("serving the page failed: {e}")),
+            }),
+        };
+        let _ = stop.send(true);
+        cluster.end().await;
+        if ended.is_ok() {
+            let _ = served.await;
+        }
+        ended
+    });
+    runtime::end(runtime);
+    result
+}
+
+/// Returns the library of the page: the volume that was given, and files that are dropped on the page.
+fn library(args: &ViewArgs, given: Source, uploads: &Path) -> Result<Library, Fail> {
+    let uploads = UploadConfig { folder: uploads.to_owned(), quota_bytes: UPLOADS };
+    let config = LibraryConfig {
+        given: Some(given),
+        folder: None,
+        uploads: Some(uploads),
+        memory_bytes: available().map_or(u64::MAX, |free| free / 2),
+        read: reader(args.input.clone(), args.axes.clone()),
+    };
+    Library::new(config).map_err(Fail::failed)
+}
+
+/// Opens an address in the browser of this machine's user.
+fn open(url: &str) {
+    let programs: &[&str] = if cfg!(target_os = "macos") {
+        &["open"]
+    } else if cfg!(windows) {
+        &["explorer"]
+    } else {
+        &["xdg-open", "gio", "sensible-browser"]
+    };
+    for program in programs {
+        let mut command = Command::new(program);
+        if *program == "gio" {
+            command.arg("open");
+        }
+        let quiet =
+            command.arg(url).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+        if quiet.spawn().is_ok() {
+            return;
+        }
+    }
+    progress::note("no program to open a browser was found; open the address yourself");
+}

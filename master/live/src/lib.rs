@@ -1,0 +1,36 @@
+//! The page of a master: its files, live pictures over a WebSocket, and calls over HTTP
+//! (docs/reference/live.md).
+//!
+//! - [`serve`] answers connections that the master's listener passes on.
+//! - `slot` decides which pass a session draws next, `preview` how coarsely it moves; both are pure.
+//! - `session` is one page: it reads, draws, encodes and writes. `picture` draws one pass as a job of
+//!   one frame of the master, `tile` encodes it.
+//! - `volume` describes a volume for an editor, `news` tells of jobs, workers and volumes.
+//! - `guard` knows who may call, `http` and `uploads` have the calls beside the socket, `assets` the page's
+//!   files. [`Files`] writes what people keep; the program brings it.
+//!
+//! Nothing here draws: workers do. Nothing slow runs on the runtime's threads: reading and encoding
+//! have threads of their own.
+
+mod assets;
+mod files;
+mod guard;
+mod http;
+mod messages;
+mod news;
+mod pick;
+mod picture;
+mod preview;
+mod problem;
+mod server;
+mod session;
+mod shared;
+mod slot;
+mod tile;
+mod uploads;
+mod volume;
+
+pub use files::{Files, MadeFile, Making, Recipe};
+pub use server::serve;
+pub use shared::LiveConfig;
+pub use volume::Home;

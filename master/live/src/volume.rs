@@ -1,0 +1,249 @@
+//! The message `volume`: all that an editor needs, and the home view.
+
+use crate::problem::Problem;
+use serde_json::{Value, json};
+use slabcast_common::quality::Compositing;
+use slabcast_common::transfer::{Classifier, TransferFunction};
+use slabcast_common::volume::{Lattice, VolumeInfo};
+use slabcast_master::ServedVolume;
+use slabcast_master::library::OpenVolume;
+use slabcast_scene::path::{Fit, Framing, Key, KeyFrames, Orientation, ViewPath};
+use slabcast_scene::presets::{self, Levels};
+use slabcast_scene::request::VolumeChoice;
+use slabcast_scene::transfer::TransferChoice;
+use slabcast_scene::values::in_values;
+use slabcast_volumes::framing::framing_of;
+use std::sync::Arc;
+
+/// Azimuth of the home view in degrees: where `slabcast render` begins.
+const HOME_AZIMUTH: f64 = 20.0;
+
+/// A volume that a session shows.
+#[derive(Clone)]
+pub(crate) struct Shown {
+    pub(crate) served: Arc<ServedVolume>,
+    /// Whether stills are drawn at the level that fits: a file too large for memory.
+    pub(crate) is_large: bool,
+    pub(crate) home: Key,
+    pub(crate) home_tf: TransferChoice,
+    /// The message.
+    pub(crate) message: Arc<Value>,
+}
+
+impl Shown {
+    /// Returns the description of the volume.
+    pub(crate) fn info(&self) -> &VolumeInfo {
+        &self.served.info
+    }
+
+    /// Returns the choice of a request.
+    pub(crate) fn choice(&self) -> VolumeChoice {
+        VolumeChoice::Digest(self.served.info.digest)
+    }
+}
+
+/// The box of the volume's cells (N samples count as N spacings), in world units.
+fn world_box(lattice: &Lattice) -> [[f64; 3]; 2] {
+    let half = lattice.steps.iter().zip(lattice.dims).map(|(s, n)| s.abs() * f64::from(n) / 2.0);
+    let half = half.fold(glam::DVec3::ZERO, |sum, h| sum + h);
+    [lattice.centre() - half, lattice.centre() + half].map(|v| v.to_array())
+}
+
+/// Returns the share of the samples that a function shows, by the histogram: each bin counts as its
+/// middle.
+fn visible_share(tf: &TransferFunction, info: &VolumeInfo) -> f64 {
+    let summary = &info.summary;
+    let classifier = Classifier::new(tf, info, Compositing::Linear);
+    let (from, to, counts) = histogram(info);
+    let bins = counts.len() as f64;
+    let (mut seen, mut all) = (0, 0);
+    for (i, &count) in counts.iter().enumerate() {
+        let value = from + (to - from) * (i as f64 + 0.5) / bins;
+        let code = (value - summary.map.offset) / summary.map.scale;
+        all += count;
+        seen += if classifier.optics_at(code)[0] > 0.0 { count } else { 0 };
+    }
+    seen as f64 / all.max(1) as f64
+}
+
+/// Returns the values between which the histogram lies, and its counts.
+fn histogram(info: &VolumeInfo) -> (f64, f64, &[u64]) {
+    let summary = &info.summary;
+    let value = |code: f64| summary.map.offset + summary.map.scale * code;
+    match &summary.core {
+        Some(core) => (value(core.min_code), value(core.max_code), &core.histogram),
+        // Bins of 8-bit volumes are codes.
+        None if summary.kind == slabcast_common::volume::SampleKind::U8 => {
+            (value(-0.5), value(255.5), &summary.histogram)
+        }
+        None => (value(summary.min_code), value(summary.max_code), &summary.histogram),
+    }
+}
+
+/// Presets and colour maps as the message lists them, each fitted to the volume.
+fn presets_of(info: &VolumeInfo) -> Vec<Value> {
+    let maps = presets::MAPS.iter().map(|preset| (preset, true));
+    let named = presets::NAMES.iter().map(|preset| (preset, false));
+    let fitted = named.chain(maps).filter_map(|((name, words), is_map)| {
+        let tf = presets::by_name(name, &info.summary).ok()?;
+        let share = visible_share(&tf, info);
+        let tf: Value = serde_json::from_str(&in_values(&tf, info).to_json()).ok()?;
+        Some(json!({"name": name, "for": words, "share": share, "map": is_map, "tf": tf}))
+    });
+    fitted.collect()
+}
+
+/// Returns a choice's function in full.
+///
+/// # Errors
+/// There is no such preset, or the function is wrong in itself.
+pub(crate) fn function(
+    choice: &TransferChoice,
+    info: &VolumeInfo,
+) -> Result<TransferFunction, Problem> {
+    match choice {
+        TransferChoice::Name(name) => {
+            presets::by_name(name, &info.summary).map_err(|e| Problem::field(&e))
+        }
+        TransferChoice::Function(tf) => {
+            tf.check().map_err(|e| Problem::field(&e))?;
+            Ok((**tf).clone())
+        }
+    }
+}
+
+/// Returns target and height for which what a function shows fills the picture; `None` if it shows
+/// nothing.
+///
+/// # Errors
+/// A field of the path doesn't fit the volume, or its file can't be read.
+pub(crate) fn framed(
+    open: &OpenVolume,
+    path: &ViewPath,
+    tf: &TransferFunction,
+) -> Result<Option<Framing>, Problem> {
+    let path = ViewPath { fit: Fit::Visible, ..path.clone() };
+    framing_of(&path, &*open.source, &open.served.outlines, tf, open.served.orientation).map_err(
+        |e| match e {
+            slabcast_volumes::framing::FramingError::Field(field) => Problem::field(&field),
+            slabcast_volumes::framing::FramingError::File(problem) => {
+                Problem::new("volume_not_readable", problem.to_string())
+            }
+        },
+    )
+}
+
+/// Returns the decimals to which numbers of a view are rounded whose picture is `height` high; below 0
+/// where tens do.
+fn rounding(height: f64) -> i32 {
+    -(libm::log10(height.max(f64::MIN_POSITIVE) * 1e-4).floor() as i32)
+}
+
+/// Returns the number nearest to `x` with so many decimals, as its text is read.
+fn rounded(x: f64, decimals: i32) -> f64 {
+    if decimals >= 0 {
+        let text = format!("{x:.*}", decimals.min(300) as usize);
+        return text.parse().unwrap_or(x) + 0.0;
+    }
+    let unit = 10f64.powi(-decimals);
+    (x / unit).round() * unit
+}
+
+/// What a master shows first.
+#[derive(Clone, Debug, Default)]
+pub struct Home {
+    /// Preset of the first picture; default `auto`.
+    pub tf: Option<String>,
+    /// What a command line names as the volume, where that is more than its name.
+    pub file: Option<String>,
+}
+
+/// Describes an open volume for a picture of `size`. Takes a tenth of a second: what can be seen is
+/// looked for.
+///
+/// # Errors
+/// The volume's file can't be read, or no camera fits it.
+pub(crate) fn describe(
+    open: &OpenVolume,
+    name: String,
+    size: [u32; 2],
+    home: &Home,
+) -> Result<Shown, Problem> {
+    let served = &open.served;
+    let info = &served.info;
+    let (summary, lattice) = (&info.summary, &info.lattice);
+    let preset = home.tf.as_deref().unwrap_or("auto");
+    let tf = presets::by_name(preset, summary).map_err(|e| Problem::field(&e))?;
+    let Orientation { up, front } = served.orientation;
+    let key = Key { azimuth: Some(HOME_AZIMUTH), elevation: Some(0.0), ..Key::default() };
+    let keyframes = KeyFrames {
+        frames: 1,
+        easing: Default::default(),
+        up: None,
+        front: None,
+        keys: vec![key.clone()],
+    };
+    let path = ViewPath { keyframes: Some(keyframes), ..ViewPath::from_views(size, Vec::new()) };
+    let framing = framed(open, &path, &tf)?;
+    let [lo, hi] = world_box(lattice);
+    let extent = (0..3).map(|a| hi[a] - lo[a]).fold(0.0, f64::max);
+    let (target, height) = match framing {
+        Some(framing) => (framing.target, framing.height),
+        None => (lattice.centre().to_array(), 1.25 * extent),
+    };
+    // Short numbers for command lines and addresses: a ten-thousandth of the picture is no pixel.
+    let digits = rounding(height);
+    let short = |x: f64| rounded(x, digits);
+    let target = target.map(short);
+    let height = if short(height) > 0.0 { short(height) } else { height };
+    let camera = Key { target: Some(target), height: Some(height), ..key };
+    let (from, to, counts) = histogram(info);
+    let (lowest, highest) = summary.range();
+    let (core_from, core_to) = summary.core_range();
+    let kind = serde_json::to_value(summary.kind).unwrap_or_default();
+    let message = json!({
+        "type": "volume",
+        "name": name,
+        "digest": info.digest.to_string(),
+        "file": home.file.clone().unwrap_or_else(|| name.clone()),
+        "dims": lattice.dims,
+        "steps": lattice.steps.map(|v| v.to_array()),
+        "box": [lo, hi],
+        "unit": if served.anatomical { "mm" } else { "" },
+        "anatomical": served.anatomical,
+        "up": up.to_string(),
+        "front": front.to_string(),
+        "sample_kind": kind,
+        "range": [lowest, highest],
+        "core": [core_from, core_to],
+        "histogram": {"from": from, "to": to, "counts": counts},
+        "gradients": null,
+        "hounsfield": Levels::from_summary(summary).water.is_some(),
+        "nan": summary.nan,
+        "presets": presets_of(info),
+        "home": {"camera": camera, "tf": preset},
+    });
+    Ok(Shown {
+        served: served.clone(),
+        is_large: open.source.whole(open.level).is_none(),
+        home: camera,
+        home_tf: TransferChoice::Name(preset.into()),
+        message: Arc::new(message),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn home_views_have_short_numbers() {
+        let decimals = rounding(265.882_352_977_647_1);
+        assert_eq!(decimals, 2);
+        assert_eq!(rounded(133.991_509_318_351_75, decimals), 133.99);
+        assert_eq!(rounded(143.000_000_015_5, decimals), 143.0);
+        assert_eq!(rounded(0.012_345, rounding(0.5)), 0.012_35);
+        assert_eq!(rounded(123_456.0, rounding(5e7)), 123_000.0);
+        assert_eq!(rounded(-0.000_1, 2).to_string(), "0");
+    }
+}

@@ -189,7 +189,7 @@ impl Handle {
         Viewer::at(peer, self.show_names)
     }
 
-    /// Runs what may read a volume's file, on a blocking thread; at most [`PLANS_AT_ONCE`] run at a
+    /// Runs what may read a volume's file, on a blocking thread; at most two run at a
     /// time. `None` if the master is gone.
     pub async fn reading<T: Send + 'static>(
         &self,
@@ -199,7 +199,7 @@ impl Handle {
     }
 
     /// Runs what looks at folders or writes a piece of an upload, on a blocking thread; at most
-    /// [`LOOKS_AT_ONCE`] run at a time. `None` if the master is gone.
+    /// four run at a time. `None` if the master is gone.
     pub async fn looking<T: Send + 'static>(
         &self,
         run: impl FnOnce(&Library) -> T + Send + 'static,

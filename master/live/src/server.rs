@@ -49,8 +49,9 @@ const HEAD_BYTES: usize = 32 << 10;
 /// Time that connections may take to end when the master does.
 const GOODBYE: Duration = Duration::from_secs(2);
 
-/// Bytes of the longest message that is read at all: of one that is too long the session tells.
-const SOCKET_BYTES: usize = 256 << 10;
+/// Bytes of the longest message that is read at all: of one that is too long the session tells, and only
+/// of one that was read can it.
+const SOCKET_BYTES: usize = 2 << 20;
 
 /// An answer, or a refusal.
 pub(crate) type Answer = Result<Response, Problem>;

@@ -28,6 +28,15 @@ struct Page {
 
 impl Drop for Page {
     fn drop(&mut self) {
+        // In order, so that its folder goes too.
+        let id = self.process.id().to_string();
+        let _ = Command::new("kill").args(["-INT", &id]).status();
+        for _ in 0..200 {
+            if matches!(self.process.try_wait(), Ok(Some(_))) {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
         let _ = self.process.kill();
         let _ = self.process.wait();
     }
@@ -493,14 +502,12 @@ async fn live_pictures_come_beside_a_job_which_goes_on() {
         );
         begun = entries.first().and_then(|job| job["frames_done"].as_u64()).unwrap_or(begun);
     }
-    let began = Instant::now();
     for seq in 1..=20u64 {
         let camera = camera(seq as f64 * 7.0);
         session.send(json!({"type": "view", "seq": seq, "camera": camera, "size": SIZE})).await;
         session.still(seq).await;
     }
-    let live = began.elapsed();
-    // The job is not over: else the pictures came behind it.
+    // The job is not over: else the pictures came behind it. A time would tell of the machine.
     let last = loop {
         let news = session.until("jobs").await;
         if let Some(job) = news["changed"].as_array().and_then(|jobs| jobs.first()) {
@@ -509,7 +516,6 @@ async fn live_pictures_come_beside_a_job_which_goes_on() {
     };
     assert_eq!((&last["state"], &last["frames_total"]), (&json!("running"), &json!(300)), "{last}");
     assert!(last["frames_done"].as_u64().is_some_and(|n| n > begun), "it goes on: {last}");
-    assert!(live < PATIENCE / 2, "20 pictures took {live:?} beside a job");
     session.send(json!({"type": "cancel_job", "id": 5, "job": answer["job"]})).await;
     assert_eq!(session.until("ok").await["id"], 5);
 }

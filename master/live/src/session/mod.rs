@@ -41,6 +41,9 @@ const PING: Duration = Duration::from_secs(20);
 /// Time after which a socket that takes no byte is given up.
 const STUCK: Duration = Duration::from_secs(60);
 
+/// Time for a client to take the close code and close.
+const FAREWELL: Duration = Duration::from_secs(1);
+
 /// Messages that wait for the socket's writer. Others wait in the session's own queue, where those
 /// of an old pass can be dropped.
 const WRITING: usize = 4;
@@ -196,8 +199,12 @@ pub(crate) async fn run(shared: Arc<Shared>, socket: WebSocket, peer: Option<IpA
         let _ = tokio::time::timeout(Duration::from_secs(1), to_writer.send(close)).await;
     }
     drop(to_writer);
+    // What the client still sends is read: a socket that is closed over unread bytes is reset, and the
+    // close code is lost on its way.
+    let rest = async { while let Some(Ok(_)) = stream.next().await {} };
+    let _ = tokio::time::timeout(FAREWELL, rest).await;
     // The writer ends when it has written, or is stuck.
-    let _ = tokio::time::timeout(Duration::from_secs(2), writer).await;
+    let _ = tokio::time::timeout(FAREWELL, writer).await;
 }
 
 /// Writes messages to the socket until there are no more, and pings.

@@ -25,6 +25,10 @@ pub const FRAMES_IN_FLIGHT: usize = 4;
 /// client without a frame in flight may begin one, up to this number.
 pub const MOST_FRAMES_IN_FLIGHT: usize = 8;
 
+/// Limit: frames of live sessions in flight beside [`MOST_FRAMES_IN_FLIGHT`] of others: they wait for no
+/// job. As many sessions as a master takes have one each.
+pub const MOST_LIVE_FRAMES: usize = 64;
+
 /// Threads of a master that hash and encode frames, one frame at a time each. A frame of 512x512
 /// takes 3 ms. With one thread, 15 workers that draw a frame in 3 ms wait for it; a third would
 /// have no frame to finish.

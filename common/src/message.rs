@@ -122,6 +122,15 @@ pub struct RegionSplit {
 /// dropped.
 pub const DIRECTORIES_KEPT: usize = 4;
 
+/// Bit of the numbers of clients that are live sessions: a person waits for their frames, so workers
+/// draw their tiles before those of jobs. Numbers stay below 2^53, which JSON has exactly.
+pub const LIVE_CLIENT: u64 = 1 << 52;
+
+/// Returns whether the client of this number is a live session ([`LIVE_CLIENT`]).
+pub fn is_live(client: u64) -> bool {
+    client & LIVE_CLIENT != 0
+}
+
 /// Reason in the goodbye of a worker that ends as it was told to. Any other reason is a fault.
 pub const TOLD_TO_STOP: &str = "told to stop";
 

@@ -13,9 +13,11 @@ use slabcast_schedule::Micros;
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
 
-/// Most brick sets side by side: a change of transfer function and back costs nothing then. More
-/// would only fill the master's memory.
-const KEPT: usize = 3;
+/// Most brick sets side by side: a change of transfer function and back costs nothing then. A live
+/// session has four: all detail and a coarser level for moving, each with all voxels too while its
+/// transfer function is edited. With 3 it cut its own sets anew at each rest; more than this would
+/// only fill the master's memory.
+const KEPT: usize = 8;
 
 /// Microseconds that a set stays at least while a job needs it. Cutting mri256 takes 0.1 s: at half
 /// of this, a tenth of the time of four jobs with four functions goes into cutting.

@@ -324,6 +324,11 @@ impl Handle {
         self.jobs.lock().get(job)?.first_kept(frame)
     }
 
+    /// Returns the first frame of a job that is kept, without taking it.
+    pub fn kept_frame(&self, job: JobId) -> Option<Arc<FinishedFrame>> {
+        self.jobs.lock().get(job)?.kept_frame()
+    }
+
     /// Returns all jobs that are remembered but for those of live sessions, oldest first.
     pub fn jobs(&self) -> Vec<JobView> {
         let table = self.jobs.lock();

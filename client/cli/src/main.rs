@@ -27,6 +27,7 @@ mod master;
 mod master_client;
 mod orient;
 mod page;
+mod page_files;
 mod read_dicom;
 mod render;
 mod rerender;

@@ -250,24 +250,7 @@ impl MasterArgs {
 /// Returns the volumes of the master: the one that was `given`, those of folders, and those of clients.
 fn library(args: &MasterArgs, given: Option<Source>, port: u16) -> Result<Library, Fail> {
     let axes = AxisArgs { up: args.up, front: args.front };
-    let input = args.input.clone();
-    let read: ReadFile = Arc::new(move |path, most_bytes| {
-        let opened = input.read(path, most_bytes);
-        // Clients are told the file's name, not its folder.
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let (OpenedSource { source, .. }, notes) = opened.map_err(|e| {
-            let is_too_large = e.problem.kind == OpenErrorKind::TooLarge;
-            Unreadable { reason: OpenError { file: name, ..e }.to_string(), is_too_large }
-        })?;
-        for note in notes {
-            info!(volume = source.name(), "{note}");
-        }
-        let orientation = axes.for_info(&source.levels()[0]).map_err(|e| {
-            let reason = e.line().unwrap_or_default().to_owned();
-            Unreadable { reason, is_too_large: false }
-        })?;
-        Ok((source, orientation))
-    });
+    let read = reader(args.input.clone(), axes);
     let folder = match &args.uploads {
         _ if args.upload_quota == 0 => None,
         Some(folder) => Some(folder.clone()),
@@ -290,6 +273,27 @@ fn library(args: &MasterArgs, given: Option<Source>, port: u16) -> Result<Librar
         Err(e) if e.starts_with("--uploads") => Err(Fail::failed(e)),
         Err(e) => Err(Fail::failed(format!("--volumes {e}"))),
     }
+}
+
+/// Returns the reader of files of folders and pages: what `input` says of files holds for each.
+pub(crate) fn reader(input: volume::InputArgs, axes: AxisArgs) -> ReadFile {
+    Arc::new(move |path, most_bytes| {
+        let opened = input.read(path, most_bytes);
+        // Clients are told the file's name, not its folder.
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let (OpenedSource { source, .. }, notes) = opened.map_err(|e| {
+            let is_too_large = e.problem.kind == OpenErrorKind::TooLarge;
+            Unreadable { reason: OpenError { file: name, ..e }.to_string(), is_too_large }
+        })?;
+        for note in notes {
+            info!(volume = source.name(), "{note}");
+        }
+        let orientation = axes.for_info(&source.levels()[0]).map_err(|e| {
+            let reason = e.line().unwrap_or_default().to_owned();
+            Unreadable { reason, is_too_large: false }
+        })?;
+        Ok((source, orientation))
+    })
 }
 
 /// Returns where volumes of clients go by default: a folder for each port, so that two masters of one

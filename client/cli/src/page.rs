@@ -1,11 +1,13 @@
 //! The page of a master: its flags, and serving it beside gRPC.
 
+use crate::page_files::PageFiles;
 use slabcast_live::{Home, LiveConfig};
 use slabcast_master::Handle;
 use slabcast_master::serve::serve_with_pages;
 use slabcast_session::fail::Fail;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use tokio::net::TcpListener;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
@@ -102,7 +104,8 @@ pub(crate) fn serve(
     stop: &watch::Receiver<bool>,
 ) -> JoinHandle<std::io::Result<()>> {
     let (to_page, connections) = mpsc::channel(WAITING);
-    let page = slabcast_live::serve(handle.clone(), config, connections, stop.clone());
+    let files = Arc::new(PageFiles);
+    let page = slabcast_live::serve(handle.clone(), config, files, connections, stop.clone());
     let page = tokio::spawn(page);
     let grpc = serve_with_pages(handle, listener, stop.clone(), Some(to_page));
     tokio::spawn(async move {

@@ -3,19 +3,25 @@
 //! A master and workers run inside this process, as `render` has them, and serve the page of every
 //! master on a port of this machine until Ctrl-C.
 
-use crate::master::{bind, listen, local};
+use crate::master::{bind, listen, local, reader};
 use crate::page::{self, PageArgs};
 use slabcast_live::Home;
+use slabcast_master::library::{Source, UploadConfig};
+use slabcast_master::memory::available;
+use slabcast_master::{Library, LibraryConfig};
 use slabcast_scene::presets;
-use slabcast_session::embedded::{Cluster, WorkerGroup};
+use slabcast_session::embedded::{Cluster, SHARED, WorkerGroup};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress;
 use slabcast_session::request::AxisArgs;
 use slabcast_session::transfer::NameOrFile;
 use slabcast_session::{parse, runtime, signals, volume};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use tokio::sync::watch;
+
+/// Bytes that files dropped on the page may take on disk.
+const UPLOADS: u64 = 16 << 30;
 
 /// Shows a volume in a web browser, to turn, colour and cut it.
 #[derive(clap::Args, Clone, Debug)]
@@ -76,11 +82,21 @@ pub(crate) fn run(args: &ViewArgs) -> Result<(), Fail> {
     let socket = runtime.block_on(bind(&args.listen, args.insecure))?;
     let opened = args.input.open_source(&args.volume)?;
     let orientation = args.axes.for_info(opened.info())?;
+    // Workers share the master's bricks of a volume in memory; of a file both drop what exceeds
+    // their memory.
+    let brick_bytes = match opened.source.whole(0) {
+        Some(_) => SHARED,
+        None => available().map_or(SHARED, |free| free / 4 / u64::from(crew.workers)),
+    };
+    // Files that are dropped on the page live as long as the page.
+    let uploads = tempfile::Builder::new().prefix("slabcast-view-").tempdir();
+    let uploads = uploads.map_err(|e| Fail::failed(format!("making a folder failed: {e}")))?;
     let result = runtime.block_on(async {
         let listener = listen(socket, &args.listen)?;
         let address = local(&listener)?;
         let url = page::url(address, &config);
-        let mut cluster = Cluster::of(opened.source, orientation, crew, None)?;
+        let library = library(args, (opened.source, orientation), uploads.path())?;
+        let mut cluster = Cluster::with_library(library, crew, brick_bytes, None)?;
         signals::listen();
         let (stop, stopped) = watch::channel(false);
         let mut served = page::serve(cluster.handle(), listener, config, &stopped);
@@ -108,6 +124,19 @@ pub(crate) fn run(args: &ViewArgs) -> Result<(), Fail> {
     });
     runtime::end(runtime);
     result
+}
+
+/// Returns the library of the page: the volume that was given, and files that are dropped on the page.
+fn library(args: &ViewArgs, given: Source, uploads: &Path) -> Result<Library, Fail> {
+    let uploads = UploadConfig { folder: uploads.to_owned(), quota_bytes: UPLOADS };
+    let config = LibraryConfig {
+        given: Some(given),
+        folder: None,
+        uploads: Some(uploads),
+        memory_bytes: available().map_or(u64::MAX, |free| free / 2),
+        read: reader(args.input.clone(), args.axes.clone()),
+    };
+    Library::new(config).map_err(Fail::failed)
 }
 
 /// Opens an address in the browser of this machine's user.

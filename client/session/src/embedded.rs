@@ -31,7 +31,7 @@ use tokio::task::JoinSet;
 const LEAVE: Duration = Duration::from_secs(2);
 
 /// Brick budget of a worker that shares the master's bricks: none of its own is used.
-const SHARED: u64 = 1 << 40;
+pub const SHARED: u64 = 1 << 40;
 
 /// Silence after which a worker of this process would be lost, in microseconds: a day. A thread
 /// that dies ends its link; silence only says that the process was stopped for a while (Ctrl-Z, a
@@ -111,7 +111,21 @@ impl Cluster {
             Some(_) => SHARED,
             None => available().map_or(SHARED, |free| free / 4 / u64::from(crew.workers.max(1))),
         };
-        let mut config = MasterConfig::of(Library::of_source(source, orientation));
+        Cluster::with_library(Library::of_source(source, orientation), crew, brick_bytes, record)
+    }
+
+    /// Starts a master of `library`, and workers which hold `brick_bytes` of bricks each beyond those
+    /// that they share with it.
+    ///
+    /// # Errors
+    /// The system gives no threads.
+    pub fn with_library(
+        library: Library,
+        crew: WorkerGroup,
+        brick_bytes: u64,
+        record: Option<Recorder>,
+    ) -> Result<Cluster, Fail> {
+        let mut config = MasterConfig::of(library);
         config.schedule.silence = SILENCE;
         config.schedule.unresponsive_after = 0;
         config.record = record;

@@ -6,16 +6,19 @@
 //! - `session` is one page: it reads, draws, encodes and writes. `picture` draws one pass as a job of
 //!   one frame of the master, `tile` encodes it.
 //! - `volume` describes a volume for an editor, `news` tells of jobs, workers and volumes.
-//! - `guard` knows who may call, `http` has the calls beside the socket, `assets` the page's files.
+//! - `guard` knows who may call, `http` and `uploads` have the calls beside the socket, `assets` the page's
+//!   files. [`Files`] writes what people keep; the program brings it.
 //!
 //! Nothing here draws: workers do. Nothing slow runs on the runtime's threads: reading and encoding
 //! have threads of their own.
 
 mod assets;
+mod files;
 mod guard;
 mod http;
 mod messages;
 mod news;
+mod pick;
 mod picture;
 mod preview;
 mod problem;
@@ -24,8 +27,10 @@ mod session;
 mod shared;
 mod slot;
 mod tile;
+mod uploads;
 mod volume;
 
+pub use files::{Files, MadeFile, Making, Recipe};
 pub use server::serve;
 pub use shared::LiveConfig;
 pub use volume::Home;

@@ -1,11 +1,12 @@
 //! News of jobs, workers and volumes: whole entries at first, then those that changed.
 
+use crate::shared::Shared;
 use serde_json::{Value, json};
-use slabcast_master::Handle;
 use slabcast_master::jobs::{JobState, JobView};
 use slabcast_master::library::Viewer;
 use slabcast_proto::model::{VolumeEntry, VolumeOrigin, Worker};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 /// Interval of news.
@@ -20,6 +21,26 @@ type Entries = BTreeMap<String, Value>;
 /// The present state of what is watched, by kind.
 #[derive(Default)]
 pub(crate) struct Snapshot(BTreeMap<&'static str, Entries>);
+
+impl Snapshot {
+    /// Returns messages with at most `count` jobs before job number `before`, the newest first.
+    pub(crate) fn jobs_before(&self, before: u64, count: usize) -> Vec<Value> {
+        let Some(jobs) = self.0.get("jobs") else { return Vec::new() };
+        let number = |id: &str| id.strip_prefix("job-").and_then(|n| n.parse::<u64>().ok());
+        let older = jobs.iter().filter(|(id, _)| number(id).is_some_and(|n| n < before));
+        let mut entries: Vec<&Value> = older.map(|(_, entry)| entry).collect();
+        entries.sort_by_key(|entry| std::cmp::Reverse(entry["job"].as_str().and_then(number)));
+        entries.truncate(count);
+        let message = |part: &[&Value]| {
+            json!({"type": "jobs", "reset": false, "changed": part, "removed": [],
+                   "total": jobs.len()})
+        };
+        match entries.is_empty() {
+            true => vec![message(&[])],
+            false => entries.chunks(ENTRIES).map(message).collect(),
+        }
+    }
+}
 
 /// What a session was told.
 #[derive(Default)]
@@ -60,16 +81,21 @@ impl News {
 }
 
 /// Looks at what is watched.
-pub(crate) async fn look(handle: &Handle, viewer: Viewer, watched: &[String]) -> Snapshot {
+pub(crate) async fn look(shared: &Arc<Shared>, viewer: Viewer, watched: &[String]) -> Snapshot {
+    let handle = &shared.handle;
     let mut found = Snapshot::default();
     let is_watched = |kind: &str| watched.iter().any(|w| w == kind);
     if is_watched("jobs") {
-        let jobs = handle.clone();
+        let (jobs, results) = (handle.clone(), shared.clone());
         let listed = tokio::task::spawn_blocking(move || {
             let entry = |view: JobView| {
                 let name = jobs.library().name_of(view.volume, viewer);
                 // Ids of equal length sort as their numbers do.
-                (format!("{:020}", view.id.0), job_entry(&view, &name))
+                let mut entry = job_entry(&view, &name);
+                if let Some((format, result)) = results.results.told(view.id) {
+                    (entry["format"], entry["result"]) = (format.into(), result);
+                }
+                (format!("{:020}", view.id.0), entry)
             };
             jobs.jobs().into_iter().map(entry).collect()
         });

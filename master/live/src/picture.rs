@@ -121,8 +121,13 @@ pub(crate) async fn frame_of(
     viewer: Viewer,
 ) -> Result<Arc<FinishedFrame>, Problem> {
     let request = PathRequest { client_key: shared.fresh_key(), ..request.clone() };
+    let began = Instant::now();
     let mut drawing = shared.handle.draw(request, session, viewer).await?;
-    drawing.finished().await.map_err(|reason| Problem::new("internal", reason))
+    let submitted_ms = ms(began);
+    let frame = drawing.finished().await.map_err(|reason| Problem::new("internal", reason))?;
+    let scheduled = frame.stats.ms;
+    tracing::debug!(session, submitted_ms, whole_ms = ms(began), ?scheduled, "live pass drawn");
+    Ok(frame)
 }
 
 /// Draws and encodes a pass.

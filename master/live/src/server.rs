@@ -4,6 +4,7 @@
 //! `/v1/`, or from its last `/` for files of the page.
 
 use crate::assets;
+use crate::files::Files;
 use crate::http;
 use crate::problem::Problem;
 use crate::session;
@@ -50,14 +51,15 @@ const SOCKET_BYTES: usize = 256 << 10;
 pub(crate) type Answer = Result<Response, Problem>;
 
 /// Serves the page of `handle` on connections that [`slabcast_master::serve::serve_with_pages`]
-/// passes on, until `stop` turns true.
+/// passes on, until `stop` turns true. `files` writes pictures and movies that people keep.
 pub async fn serve(
     handle: Handle,
     config: LiveConfig,
+    files: Arc<dyn Files>,
     mut connections: mpsc::Receiver<PageConnection>,
     mut stop: watch::Receiver<bool>,
 ) {
-    let shared = Arc::new(Shared::new(handle, config, stop.clone()));
+    let shared = Arc::new(Shared::new(handle, config, files, stop.clone()));
     let places = Arc::new(Semaphore::new(CONNECTIONS));
     let mut open = JoinSet::new();
     loop {

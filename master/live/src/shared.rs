@@ -1,5 +1,6 @@
 //! What all sessions and calls of a master's page share.
 
+use crate::files::Files;
 use crate::guard::Guard;
 use crate::volume::Home;
 use slabcast_master::Handle;
@@ -37,20 +38,31 @@ pub(crate) struct Shared {
     pub(crate) guard: Guard,
     pub(crate) sessions: Arc<Semaphore>,
     pub(crate) stop: watch::Receiver<bool>,
+    pub(crate) files: Arc<dyn Files>,
     pub(crate) states: crate::http::States,
+    pub(crate) results: crate::http::Results,
+    pub(crate) uploads: crate::uploads::Uploads,
     started: Instant,
     last_id: AtomicU64,
 }
 
 impl Shared {
-    pub(crate) fn new(handle: Handle, config: LiveConfig, stop: watch::Receiver<bool>) -> Shared {
+    pub(crate) fn new(
+        handle: Handle,
+        config: LiveConfig,
+        files: Arc<dyn Files>,
+        stop: watch::Receiver<bool>,
+    ) -> Shared {
         Shared {
             guard: Guard::new(&config.machine, &config.allowed_hosts, config.token.as_deref()),
             handle,
             config,
             sessions: Arc::new(Semaphore::new(SESSIONS)),
             stop,
+            files,
             states: Default::default(),
+            results: Default::default(),
+            uploads: Default::default(),
             started: Instant::now(),
             last_id: AtomicU64::new(0),
         }

@@ -22,8 +22,6 @@ const HOME_AZIMUTH: f64 = 20.0;
 #[derive(Clone)]
 pub(crate) struct Shown {
     pub(crate) served: Arc<ServedVolume>,
-    /// Name as the client may know it.
-    pub(crate) name: String,
     /// Whether stills are drawn at the level that fits: a file too large for memory.
     pub(crate) is_large: bool,
     pub(crate) home: Key,
@@ -93,6 +91,25 @@ fn presets_of(info: &VolumeInfo) -> Vec<Value> {
         Some(json!({"name": name, "for": words, "share": share, "map": is_map, "tf": tf}))
     });
     fitted.collect()
+}
+
+/// Returns a choice's function in full.
+///
+/// # Errors
+/// There is no such preset, or the function is wrong in itself.
+pub(crate) fn function(
+    choice: &TransferChoice,
+    info: &VolumeInfo,
+) -> Result<TransferFunction, Problem> {
+    match choice {
+        TransferChoice::Name(name) => {
+            presets::by_name(name, &info.summary).map_err(|e| Problem::field(&e))
+        }
+        TransferChoice::Function(tf) => {
+            tf.check().map_err(|e| Problem::field(&e))?;
+            Ok((**tf).clone())
+        }
+    }
 }
 
 /// Returns target and height for which what a function shows fills the picture; `None` if it shows
@@ -185,7 +202,6 @@ pub(crate) fn describe(
     });
     Ok(Shown {
         served: served.clone(),
-        name,
         is_large: open.source.whole(open.level).is_none(),
         home: camera,
         home_tf: TransferChoice::Name(preset.into()),

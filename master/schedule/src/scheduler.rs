@@ -17,8 +17,8 @@ use crate::state::workers::{LANES, Newcomer, Roster, Worker};
 use crate::{Action, Clock, Config, Event, FrameJob, Micros, Totals, WorkerIdentity, WorkerView};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{Epoch, FrameId, SceneId, TaskId, WorkerId};
-use slabcast_common::link::{FRAMES_IN_FLIGHT, MOST_FRAMES_IN_FLIGHT};
-use slabcast_common::message::ToWorker;
+use slabcast_common::link::{FRAMES_IN_FLIGHT, MOST_FRAMES_IN_FLIGHT, MOST_LIVE_FRAMES};
+use slabcast_common::message::{ToWorker, is_live};
 use slabcast_common::occlusion::Rect;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -625,7 +625,12 @@ impl Scheduler {
         let own = self.active.iter().filter(|f| f.client() == job.client).count();
         let by_region = uses_regions(job) && self.active.iter().all(|f| f.as_region().is_some());
         if own == 0 || !by_region {
-            return by_region && self.active.len() < MOST_FRAMES_IN_FLIGHT;
+            let live = self.active.iter().filter(|f| is_live(f.client())).count();
+            let room = match is_live(job.client) {
+                true => live < MOST_LIVE_FRAMES,
+                false => self.active.len() - live < MOST_FRAMES_IN_FLIGHT,
+            };
+            return by_region && room;
         }
         let is_saturated = self.cluster.link_use.is_saturated();
         let most = if is_saturated { FRAMES_ON_A_SATURATED_LINK } else { FRAMES_IN_FLIGHT };

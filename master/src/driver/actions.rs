@@ -8,7 +8,7 @@ use crate::link::{BrickOrder, Losses};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, Epoch, FrameId, JobId, TaskId, WorkerId};
 use slabcast_common::image::{FrameState, SparseTile};
-use slabcast_common::message::ToWorker;
+use slabcast_common::message::{ToWorker, is_live};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::stats::{FrameStats, PoisonedTile};
 use slabcast_schedule::{Action, Event as Happened, Micros, Spans, WorkerIdentity};
@@ -244,7 +244,12 @@ impl Driver {
         let Some(flight) = self.land(flight) else { return };
         flight.frame_span.in_scope(|| {
             let FrameStats { ms, pixels_sha256, .. } = &frame.stats;
-            info!(ms = ms.total, pixels_sha256, "frame done");
+            // Sixty a second of a session.
+            if is_live(flight.client) {
+                debug!(ms = ms.total, "live frame done");
+            } else {
+                info!(ms = ms.total, pixels_sha256, "frame done");
+            }
         });
         self.log_reserve();
         let number = frame.number;
@@ -258,6 +263,7 @@ impl Driver {
                 Some(JobState::Incomplete(_)) => {
                     warn!(job = %id, "job is over, and frames of it failed");
                 }
+                _ if is_live(flight.client) => {}
                 _ => info!(job = %id, "job done"),
             }
             self.retire();

@@ -24,7 +24,8 @@ use crate::memory::{Shares, brick_set_bytes, making_bytes};
 use crate::panics::caught;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, JobId};
-use slabcast_common::link::{FRAMES_IN_FLIGHT, MOST_FRAMES_IN_FLIGHT};
+use slabcast_common::link::{FRAMES_IN_FLIGHT, MOST_FRAMES_IN_FLIGHT, MOST_LIVE_FRAMES};
+use slabcast_common::message::is_live;
 use slabcast_common::quality::Schedule;
 use slabcast_schedule::{Clock, Event as Happened, FrameJob, Micros};
 use slabcast_volumes::BrickStore;
@@ -99,7 +100,7 @@ impl Driver {
     pub(super) fn feed(&mut self) {
         self.look_again_at = None;
         self.make_way();
-        while self.flights.len() < MOST_FRAMES_IN_FLIGHT {
+        while self.flights.len() < MOST_FRAMES_IN_FLIGHT + MOST_LIVE_FRAMES {
             let Some((candidate, in_reserve)) = self.pick() else { break };
             if !self.begin(candidate, in_reserve) {
                 break;
@@ -185,7 +186,9 @@ impl Driver {
         let client = self.active.client_of(candidate.job);
         let mut own = self.flights.values().filter(|f| f.client == client).peekable();
         if own.peek().is_none() {
-            return self.flights.len() < MOST_FRAMES_IN_FLIGHT;
+            // Sessions have at most one each, and what they wait for is drawn first.
+            let of_jobs = self.flights.values().filter(|f| !is_live(f.client)).count();
+            return is_live(client) || of_jobs < MOST_FRAMES_IN_FLIGHT;
         }
         self.flights.len() < FRAMES_IN_FLIGHT && own.all(|f| f.scene.bricks == job.scene.bricks)
     }

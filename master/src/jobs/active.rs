@@ -4,7 +4,7 @@ use super::Table;
 use super::submit::Views;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, JobId, SceneId};
-use slabcast_common::message::SceneSpec;
+use slabcast_common::message::{LIVE_CLIENT, SceneSpec};
 use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_scene::request::PathRequest;
 use slabcast_scene::tween::Tween;
@@ -122,7 +122,8 @@ impl ActiveJobs {
         let least = self.peers.values().map(|peer| peer.work_us).min().unwrap_or(0);
         self.peers.entry(peer).or_insert_with(|| {
             self.last_client += 1;
-            Peer { client: self.last_client, work_us: least }
+            let class = if peer.is_live() { LIVE_CLIENT } else { 0 };
+            Peer { client: self.last_client | class, work_us: least }
         });
         self.peer_of.insert(id, peer);
         self.by_id.insert(id, job);
@@ -191,7 +192,7 @@ impl ActiveJobs {
     /// The frame that each job would begin next: one that a watcher waits for, or else the next that
     /// was never rendered. Jobs of the address that took least time come first, and among its
     /// jobs those in earlier turns. Within a turn, frames that are waited for come first, and older
-    /// jobs. `is_in_flight` tells of frames that are being rendered.
+    /// jobs. Frames of live sessions come before all others. `is_in_flight` tells of frames that are being rendered.
     pub(crate) fn candidates(
         &self,
         table: &Table,
@@ -211,9 +212,10 @@ impl ActiveJobs {
             let active = self.by_id.get(&id)?;
             let peer = self.peer_of.get(&id).and_then(|peer| self.peers.get(peer));
             let work = peer.map(|peer| peer.work_us);
-            Some(((work, active.turn()), next(id, active)?))
+            let is_batch = !self.peer_of.get(&id).is_some_and(|peer| peer.is_live());
+            Some(((is_batch, work, active.turn()), next(id, active)?))
         });
-        let mut candidates: Vec<((Option<u64>, u32), Candidate)> = jobs.collect();
+        let mut candidates: Vec<((bool, Option<u64>, u32), Candidate)> = jobs.collect();
         candidates.sort_by_key(|(turn, candidate)| (*turn, !candidate.wanted));
         candidates.into_iter().map(|(_, candidate)| candidate).collect()
     }

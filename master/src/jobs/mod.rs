@@ -220,6 +220,11 @@ impl Job {
         self.frames.range(number..).next().map(|(number, _)| *number)
     }
 
+    /// Returns the first frame that is kept.
+    pub(crate) fn kept_frame(&self) -> Option<Arc<FinishedFrame>> {
+        self.frames.values().next().map(|kept| kept.frame.clone())
+    }
+
     /// Whether it is over and has failed frames that may be drawn again.
     pub(crate) fn may_retry(&self) -> bool {
         matches!(self.view.state, JobState::Incomplete(_)) && !self.failed.is_empty()

@@ -14,6 +14,7 @@ use std::fs::{File, TryLockError};
 use std::io::Write;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use tracing::{info, warn};
@@ -32,6 +33,8 @@ const LOCK: &str = ".lock";
 const WHOLE: &str = "volume";
 /// Ending of files of uploads in progress.
 const PART: &str = "part";
+/// Ending of folders with files that are to be read.
+const FILES: &str = "files";
 
 /// Folder and quota of uploaded volumes.
 #[derive(Clone, Debug)]
@@ -62,6 +65,8 @@ pub(super) struct Whole {
 pub(super) struct Uploads {
     config: UploadConfig,
     parts: Mutex<BTreeMap<Digest32, Arc<Mutex<Part>>>>,
+    /// Number of the next folder for files.
+    folders: AtomicU64,
     /// Keeps other masters away from the folder.
     _lock: File,
 }
@@ -115,10 +120,39 @@ impl Uploads {
         for file in std::fs::read_dir(folder).map_err(failed)? {
             let path = file.map_err(failed)?.path();
             if path.extension().is_some_and(|e| e == PART) {
-                let _ = std::fs::remove_file(path);
+                let _ = std::fs::remove_file(&path);
+            }
+            if path.extension().is_some_and(|e| e == FILES) {
+                let _ = std::fs::remove_dir_all(&path);
             }
         }
-        Ok(Uploads { config, parts: Mutex::default(), _lock: lock })
+        let (parts, folders) = Default::default();
+        Ok(Uploads { config, parts, folders, _lock: lock })
+    }
+
+    /// Makes an empty folder for files of `bytes` bytes in all. `held_bytes`: of the volumes that are
+    /// there. Whoever asked removes it; a master that begins removes what an earlier one left.
+    ///
+    /// # Errors
+    /// There is no place for them.
+    pub(super) fn folder_for(&self, bytes: u64, held_bytes: u64) -> Result<PathBuf, VolumeError> {
+        let coming: u64 = lock(&self.parts).values().map(|part| lock(part).total).sum();
+        let quota = self.config.quota_bytes;
+        if held_bytes.saturating_add(coming).saturating_add(bytes) > quota {
+            let mib = |bytes: u64| bytes.div_ceil(1 << 20);
+            let why = format!(
+                "the files take {} MiB, and of the {} MiB for uploaded volumes (--upload-quota) {} MiB \
+                 are used; remove a volume",
+                mib(bytes),
+                quota >> 20,
+                mib(held_bytes + coming)
+            );
+            return Err(VolumeError::NoRoom(why, false));
+        }
+        let number = self.folders.fetch_add(1, Ordering::Relaxed);
+        let path = self.config.folder.join(format!("{}-{number}.{FILES}", std::process::id()));
+        std::fs::create_dir(&path).map_err(|e| no_place(&path, &e))?;
+        Ok(path)
     }
 
     /// Returns the volumes that are there, each with its name. Warns of files that are damaged.

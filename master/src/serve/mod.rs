@@ -13,8 +13,7 @@ mod render;
 mod volumes;
 
 pub use connections::PageConnection;
-pub use peers::PeerLimits;
-pub(crate) use peers::counted_as;
+pub use peers::{PeerLimits, counted_as};
 pub use render::notice;
 
 use crate::Handle;

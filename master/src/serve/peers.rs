@@ -44,7 +44,7 @@ const LINE_EVERY: Duration = Duration::from_secs(1);
 
 /// Returns the address that limits count by: IPv4 addresses as such, of IPv6 the network of 64 bits
 /// that a site gives to one machine.
-pub(crate) fn counted_as(ip: IpAddr) -> IpAddr {
+pub fn counted_as(ip: IpAddr) -> IpAddr {
     match ip.to_canonical() {
         IpAddr::V6(v6) if !v6.is_loopback() => {
             IpAddr::V6(Ipv6Addr::from_bits(v6.to_bits() & !u128::from(u64::MAX)))

@@ -10,6 +10,7 @@
 
 mod draw;
 mod queue;
+mod shares;
 mod slots;
 mod task;
 

@@ -1,13 +1,16 @@
 //! The queue of render threads.
 
+use super::shares::{SLICE, Shares};
 use super::slots::{FrameSlot, locked};
 use super::task::{RegionTask, Task};
 use crate::brick_table::BrickTable;
 use slabcast_common::ids::FrameId;
 use slabcast_common::lookahead::Lookahead;
+use slabcast_common::message::is_live;
 use slabcast_common::occlusion::Rect;
 use std::cell::Cell;
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -15,39 +18,12 @@ use std::time::{Duration, Instant};
 /// then first come, first served.
 type Priority = (FrameId, bool, u64);
 
-/// Tuning (us): time slice: a region draws for so long before it gives way to a client that waits. At 5 ms a region of a
-/// frame of 1024x1024 takes 3 % longer beside another; at 100 ms a frame of 16 tiles takes 1.6 s
-/// beside one whose tiles take minutes.
-const SLICE: Duration = Duration::from_millis(20);
-
-/// Limit: clients without tasks whose time is remembered.
-const CLIENTS_KEPT: usize = 64;
-
-/// Tasks and thread time of one client.
-#[derive(Default)]
-struct Client {
-    tasks: BTreeMap<Priority, Task>,
-    spent: Duration,
-    /// Number of threads that draw a task of the client.
-    running: u32,
-}
-
-impl Client {
-    fn is_here(&self) -> bool {
-        self.running > 0 || !self.tasks.is_empty()
-    }
-
-    /// Returns the client's thread time, with one slice for each thread that draws a task of it now.
-    fn charged(&self) -> Duration {
-        self.spent + SLICE * self.running
-    }
-}
-
 #[derive(Default)]
 struct State {
-    /// Clients by number. A new client starts with the least time of all others: it is served at once,
-    /// and can't claim the time before it came.
-    clients: BTreeMap<u64, Client>,
+    /// Tasks that wait, by the number of their client.
+    clients: BTreeMap<u64, BTreeMap<Priority, Task>>,
+    /// Whose turn it is.
+    shares: Shares,
     last_number: u64,
     /// Regions in the queue whose bricks were not asked for in advance.
     unprefetched: usize,
@@ -68,32 +44,16 @@ struct State {
 }
 
 impl State {
-    /// Enters a client that is about to get tasks.
-    fn enter(&mut self, client: u64) {
-        if self.clients.get(&client).is_some_and(Client::is_here) {
-            return;
-        }
-        let here = self.clients.iter().filter(|(id, s)| **id != client && s.is_here());
-        let Some(least) = here.map(|(_, s)| s.charged()).min() else {
-            // No other client has tasks, so the time of all starts at zero.
-            self.clients.clear();
-            self.clients.insert(client, Client::default());
-            return;
-        };
-        self.clients.retain(|id, s| *id == client || s.is_here() || s.spent > least);
-        if self.clients.len() >= CLIENTS_KEPT {
-            self.clients.retain(|id, s| *id == client || s.is_here());
-        }
-        let entry = self.clients.entry(client).or_default();
-        entry.spent = entry.spent.max(least);
-    }
-
-    /// Takes the next task: of the client with the least time; between equals, of the older frame.
+    /// Takes the next task: of the client whose turn it is; between equals, of the older frame.
     fn take(&mut self) -> Option<Task> {
-        let waiting = self.clients.values_mut().filter(|s| !s.tasks.is_empty());
-        let next = waiting.min_by_key(|s| (s.charged(), s.tasks.keys().next().copied()))?;
-        let (_, task) = next.tasks.pop_first()?;
-        next.running += 1;
+        let clients = &self.clients;
+        let oldest = |client| clients.get(&client).and_then(|tasks| tasks.keys().next().copied());
+        let client = self.shares.take(oldest)?;
+        let tasks = self.clients.get_mut(&client)?;
+        let (_, task) = tasks.pop_first()?;
+        if tasks.is_empty() {
+            self.clients.remove(&client);
+        }
         Some(task)
     }
 
@@ -129,13 +89,16 @@ pub(super) struct Prefetch {
 pub(super) struct Queue {
     state: Mutex<State>,
     bell: Condvar,
+    /// Whether a live client's task waits whose turn it is: regions of jobs then give way at once, and
+    /// not after their slice.
+    live_is_due: AtomicBool,
 }
 
 impl Queue {
     /// A queue for so many threads.
     pub(super) fn new(threads: u32) -> Queue {
         let state = State { threads, ..State::default() };
-        Queue { state: Mutex::new(state), bell: Condvar::new() }
+        Queue { state: Mutex::new(state), ..Queue::default() }
     }
 
     pub(super) fn push(&self, task: Task) {
@@ -149,8 +112,9 @@ impl Queue {
         state.unprefetched += usize::from(must_prefetch);
         state.last_number += 1;
         let priority = (frame, is_new, state.last_number);
-        state.enter(client);
-        state.clients.entry(client).or_default().tasks.insert(priority, task);
+        state.shares.push(client);
+        state.clients.entry(client).or_default().insert(priority, task);
+        self.live_is_due.store(state.shares.live_is_due(), Ordering::Relaxed);
         drop(state);
         self.bell.notify_one();
     }
@@ -166,7 +130,7 @@ impl Queue {
             let mut prefetches = Vec::new();
             if state.unprefetched > 0 {
                 state.unprefetched = 0;
-                for task in state.clients.values_mut().flat_map(|s| s.tasks.values_mut()) {
+                for task in state.clients.values_mut().flat_map(BTreeMap::values_mut) {
                     let Task::Region(task) = task else { continue };
                     let is_done = std::mem::replace(&mut task.was_prefetched, true);
                     if !is_done && task.lease.begun.is_none() {
@@ -175,7 +139,9 @@ impl Queue {
                     }
                 }
             }
-            if let Some(mut task) = state.take() {
+            let taken = state.take();
+            self.live_is_due.store(state.shares.live_is_due(), Ordering::Relaxed);
+            if let Some(mut task) = taken {
                 if let Task::Region(task) = &mut task {
                     task.ahead = state.ahead(task);
                 }
@@ -194,28 +160,27 @@ impl Queue {
         let mut state = locked(&self.state);
         state.is_closed = true;
         state.clients.clear();
+        state.shares.clear();
         drop(state);
         self.bell.notify_all();
     }
 
-    /// Charges a client with `time` of a thread that draws a region. Returns whether a client with less
-    /// time waits, so that the region has to give way.
+    /// Charges a client with `time` of a thread that draws a region. Returns whether another client's
+    /// turn has come, so that the region has to give way.
     fn must_yield(&self, client: u64, time: Duration) -> bool {
         let mut state = locked(&self.state);
-        let Some(own) = state.clients.get_mut(&client) else { return false };
-        own.spent += time;
-        let spent = own.spent;
-        let mut others =
-            state.clients.iter().filter(|(id, s)| **id != client && !s.tasks.is_empty());
-        others.any(|(_, s)| s.charged() < spent)
+        state.shares.charge(client, time);
+        let must = state.shares.must_yield(client);
+        self.live_is_due.store(state.shares.live_is_due(), Ordering::Relaxed);
+        must
     }
 
     /// Charges a client with the last `time` of a thread that ended or paused a task.
     fn ran(&self, client: u64, time: Duration) {
-        if let Some(client) = locked(&self.state).clients.get_mut(&client) {
-            client.spent += time;
-            client.running = client.running.saturating_sub(1);
-        }
+        let mut state = locked(&self.state);
+        state.shares.charge(client, time);
+        state.shares.ended(client);
+        self.live_is_due.store(state.shares.live_is_due(), Ordering::Relaxed);
     }
 
     pub(super) fn set_stalled(&self, are_stalled: bool) {
@@ -249,11 +214,12 @@ impl<'a> Turn<'a> {
     }
 
     /// Whether the region has to give way to another client. Called at each sheet: reads a clock, and
-    /// locks the queue once a slice.
+    /// locks the queue once a slice, or when a live client waits.
     pub(super) fn is_over(&self) -> bool {
         let now = Instant::now();
         let time = now - self.charged_until.get();
-        if !self.is_over.get() && time >= SLICE {
+        let is_due = !is_live(self.client) && self.queue.live_is_due.load(Ordering::Relaxed);
+        if !self.is_over.get() && (time >= SLICE || is_due) {
             self.charged_until.set(now);
             self.is_over.set(self.queue.must_yield(self.client, time));
         }

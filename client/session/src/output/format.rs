@@ -80,6 +80,11 @@ impl Format {
         !self.moves() || self == Format::Apng
     }
 
+    /// Returns whether this machine can write the format: `false` where ffmpeg does and is missing.
+    pub fn is_at_hand(self) -> bool {
+        !self.by_ffmpeg() || super::ffmpeg::program().is_some()
+    }
+
     /// Returns the frames a second where the user gives none. GIFs hold hundredths of a second and
     /// each frame in full: few. A video at less than 25 stutters.
     pub fn usual_fps(self) -> u16 {

@@ -5,6 +5,7 @@
 //! (opening a volume, drawing, encoding) runs in tasks of its own and comes back as an [`Outcome`].
 
 mod asks;
+mod thumbs;
 
 use crate::messages::{Ack, Head, Hello, LONGEST, Open, Ping, Scene, View, WatchAsk};
 use crate::picture::{self, Drawn, Order, check_size, request_of};
@@ -72,6 +73,8 @@ pub(super) enum Outcome {
     Drawn { number: u64, result: Result<Box<Drawn>, Problem> },
     /// The present state of what is watched.
     News(crate::news::Snapshot),
+    /// A thumbnail was drawn, or not.
+    Thumb { id: u32, result: Result<Message, String> },
     /// Messages to be sent.
     Say(Vec<Message>),
 }
@@ -103,7 +106,6 @@ struct Session {
     shared: Arc<Shared>,
     id: u64,
     viewer: Viewer,
-    peer: Option<IpAddr>,
     codecs: Codecs,
     shown: Option<Arc<Shown>>,
     opening: bool,
@@ -124,6 +126,8 @@ struct Session {
     painted_at: Option<Instant>,
     queue: VecDeque<Queued>,
     tasks: JoinSet<Outcome>,
+    thumbs: Vec<thumbs::Wanted>,
+    thumb: Option<thumbs::InHand>,
     watched: Vec<String>,
     news: crate::news::News,
     news_asked: bool,
@@ -238,7 +242,6 @@ async fn begin(
     let session = Session {
         id: shared.fresh_id(),
         viewer: shared.handle.viewer(peer),
-        peer,
         codecs: Codecs { jpeg: takes("jpeg"), webp: takes("webp") },
         shown: None,
         opening: false,
@@ -256,6 +259,8 @@ async fn begin(
         painted_at: None,
         queue: VecDeque::new(),
         tasks: JoinSet::new(),
+        thumbs: Vec::new(),
+        thumb: None,
         watched: Vec::new(),
         news: Default::default(),
         news_asked: false,
@@ -348,6 +353,11 @@ impl Session {
         }
     }
 
+    /// Queues a message that belongs to no pass.
+    pub(super) fn send(&mut self, message: Option<Message>) {
+        self.queue.extend(message.map(|message| Queued { message, pass: None }));
+    }
+
     fn say(&mut self, value: &Value) {
         self.queue.push_back(Queued { message: text(value), pass: None });
     }
@@ -375,7 +385,7 @@ impl Session {
             "pixels_version": slabcast_common::PIXELS_VERSION, "now_ms": unix_ms(),
             "empty": shared.handle.library().list(self.viewer).is_empty(),
             "roles": ["view", "submit", "upload", "cancel"],
-            "movies": crate::http::movies(&shared), "limits": limits,
+            "movies": shared.files.movies(), "limits": limits,
         }));
     }
 
@@ -421,6 +431,7 @@ impl Session {
                     self.open(self.any_volume(), true, 0, None);
                 }
             }
+            Outcome::Thumb { id, result } => self.thumb_drawn(id, result),
             Outcome::Say(messages) => {
                 let queued = messages.into_iter().map(|message| Queued { message, pass: None });
                 self.queue.extend(queued);
@@ -445,10 +456,9 @@ impl Session {
             return;
         }
         self.news_asked = true;
-        let (handle, viewer, watched) =
-            (self.shared.handle.clone(), self.viewer, self.watched.clone());
+        let (shared, viewer, watched) = (self.shared.clone(), self.viewer, self.watched.clone());
         self.tasks.spawn(async move {
-            Outcome::News(crate::news::look(&handle, viewer, &watched).await)
+            Outcome::News(crate::news::look(&shared, viewer, &watched).await)
         });
     }
 
@@ -464,6 +474,7 @@ impl Session {
     fn opened(&mut self, shown: Shown, then: Option<First>, hello: bool, id: u64) {
         self.opening = false;
         self.drop_pass();
+        self.drop_thumb();
         self.slot.clear();
         self.preview = Preview::default();
         self.frame = None;
@@ -605,7 +616,10 @@ impl Session {
             match self.slot.step(self.preview.is_slow(), self.shared.now()) {
                 Step::Drop => self.drop_pass(),
                 Step::Begin(pair, pass) => self.begin_pass(&shown, pair, pass),
-                wait @ Step::Wait(_) => return wait,
+                wait @ Step::Wait(_) => {
+                    self.next_thumb();
+                    return wait;
+                }
             }
         }
     }
@@ -618,6 +632,7 @@ impl Session {
     }
 
     fn begin_pass(&mut self, shown: &Arc<Shown>, pair: Pair, pass: Pass) {
+        self.drop_thumb();
         let rung = if pass == Pass::Moving { self.preview.choose().0 } else { 0 };
         let edited = self.edited && pass == Pass::Moving;
         let request = request_of(shown, &self.view, &self.scene, rung, edited);

@@ -232,6 +232,25 @@ fn a_worker_killed_while_the_picture_turns_costs_no_pixel() {
 }
 
 #[test]
+fn after_a_stall_the_last_view_arrives() {
+    let _alone = alone();
+    let Some(chromium) = Chromium::start() else { return };
+    let (view, url) = view();
+    let mut page = chromium.open(&url, DESK);
+    let first = rest(&mut page);
+    view.signal("-STOP");
+    turn(&mut page, (90.0, 0.0));
+    turn(&mut page, (-30.0, 40.0));
+    page.until("document.querySelector('[data-part=state]').textContent === 'drawing'");
+    assert_eq!(page.ask("slabcast.viewer.atRest"), false, "nobody draws");
+    view.signal("-CONT");
+    let turned = rest(&mut page);
+    assert_ne!(turned, first);
+    assert_eq!(pasted(&mut page), turned);
+    page.end();
+}
+
+#[test]
 fn a_phone_turns_with_one_finger_and_zooms_with_two() {
     let _alone = alone();
     let Some(chromium) = Chromium::start() else { return };

@@ -5,7 +5,7 @@
 
 use crate::processes::Process;
 use serde_json::{Value, json};
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Write};
 use std::net::TcpStream;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -62,7 +62,9 @@ impl Chromium {
                 .ok()
         });
         let Some(mut child) = started else {
-            println!("skipped: needs chromium (apt-get install chromium)");
+            // Not captured, as what `println!` writes would be.
+            let _ =
+                writeln!(std::io::stderr(), "skipped: needs chromium (apt-get install chromium)");
             return None;
         };
         let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines();

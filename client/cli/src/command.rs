@@ -76,12 +76,13 @@ pub(crate) const GROUPS: [(&str, &[&str]); 4] = [
 ];
 
 /// Commands that the short help only names: it has to fit a screen of 24 lines.
-const ALSO: [&str; 6] = ["volumes", "put", "rm", "completions", "man", "help"];
+const ALSO: [&str; 7] = ["rerender", "volumes", "put", "rm", "completions", "man", "help"];
 
 const EXAMPLES: &str = "\
 Examples:
   slabcast demo                                  pictures without any file
   slabcast render brain.nii.gz                   36 pictures of a full turn, in slabcast-out/
+  slabcast view brain.nii.gz --open              turn and colour it in a browser
   slabcast info brain.nii.gz                     what is in the file
   slabcast master --volumes scans/               a cluster: a master,
   slabcast worker --master 127.0.0.1:7433        workers, here or elsewhere,

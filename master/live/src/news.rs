@@ -20,12 +20,16 @@ type Entries = BTreeMap<String, Value>;
 
 /// The present state of what is watched, by kind.
 #[derive(Default)]
-pub(crate) struct Snapshot(BTreeMap<&'static str, Entries>);
+pub(crate) struct Snapshot {
+    kinds: BTreeMap<&'static str, Entries>,
+    /// Render threads of the workers that are there.
+    pub(crate) threads: u32,
+}
 
 impl Snapshot {
     /// Returns messages with at most `count` jobs before job number `before`, the newest first.
     pub(crate) fn jobs_before(&self, before: u64, count: usize) -> Vec<Value> {
-        let Some(jobs) = self.0.get("jobs") else { return Vec::new() };
+        let Some(jobs) = self.kinds.get("jobs") else { return Vec::new() };
         let number = |id: &str| id.strip_prefix("job-").and_then(|n| n.parse::<u64>().ok());
         let older = jobs.iter().filter(|(id, _)| number(id).is_some_and(|n| n < before));
         let mut entries: Vec<&Value> = older.map(|(_, entry)| entry).collect();
@@ -50,7 +54,7 @@ impl News {
     /// Returns the messages that tell what changed, and takes it as told.
     pub(crate) fn changes(&mut self, now: Snapshot) -> Vec<Value> {
         let mut messages = Vec::new();
-        for (kind, entries) in now.0 {
+        for (kind, entries) in now.kinds {
             let before = self.0.get(kind);
             let is_new = |(id, entry): &(&String, &Value)| {
                 before.and_then(|before| before.get(*id)) != Some(*entry)
@@ -99,19 +103,20 @@ pub(crate) async fn look(shared: &Arc<Shared>, viewer: Viewer, watched: &[String
             };
             jobs.jobs().into_iter().map(entry).collect()
         });
-        found.0.insert("jobs", with_ids(listed.await.unwrap_or_default(), "job"));
+        found.kinds.insert("jobs", with_ids(listed.await.unwrap_or_default(), "job"));
     }
+    let workers = handle.workers().await;
+    found.threads = workers.iter().map(|worker| worker.threads).sum();
     if is_watched("workers") {
-        let workers = handle.workers().await;
         let now = crate::shared::unix_ms();
         let entries: Entries =
             workers.iter().map(|w| (format!("w{}", w.id.0), worker_entry(w, now))).collect();
-        found.0.insert("workers", entries);
+        found.kinds.insert("workers", entries);
     }
     if is_watched("volumes") {
         let listed = handle.looking(move |library| library.list(viewer)).await.unwrap_or_default();
         let entries = listed.iter().map(|entry| (entry.name.clone(), volume_entry(entry)));
-        found.0.insert("volumes", entries.collect());
+        found.kinds.insert("volumes", entries.collect());
     }
     found
 }
@@ -198,7 +203,7 @@ mod tests {
 
     fn snapshot(entries: &[(&str, u32)]) -> Snapshot {
         let of = entries.iter().map(|(id, n)| ((*id).to_owned(), json!({"job": id, "n": n})));
-        Snapshot([("jobs", of.collect())].into())
+        Snapshot { kinds: [("jobs", of.collect())].into(), threads: 1 }
     }
 
     #[test]

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::level::LevelChoice;
 use slabcast_common::quality::{InvalidField, Keep, Quality, Work};
-use slabcast_common::stats::FrameStats;
+use slabcast_common::stats::{FrameMs, FrameStats};
 use slabcast_master::jobs::FinishedFrame;
 use slabcast_master::library::Viewer;
 use slabcast_scene::document::{black, still_path};
@@ -50,8 +50,6 @@ pub(crate) fn path_of(view: &View, scene: &Scene, size: [u32; 2]) -> ViewPath {
 pub(crate) struct Order {
     pub(crate) pair: Pair,
     pub(crate) pass: Pass,
-    /// Rung of the ladder of previews; 0 of a still.
-    pub(crate) rung: usize,
     pub(crate) request: PathRequest,
     pub(crate) codecs: Codecs,
     /// The frame, if it was drawn before.
@@ -63,7 +61,7 @@ pub(crate) fn request_of(
     shown: &Shown,
     view: &View,
     scene: &Scene,
-    rung: usize,
+    (pass, rung): (Pass, usize),
     edited: bool,
 ) -> PathRequest {
     let Setting { level, divisor } = RUNGS[rung];
@@ -88,7 +86,8 @@ pub(crate) fn request_of(
         path: path_of(view, scene, size),
         transfer: as_read_from_file(transfer, info),
         quality: Quality::default(),
-        work: Work { keep, ..Work::default() },
+        // A still says how far it may be off, which costs up to a quarter of its time.
+        work: Work { keep, estimate: pass == Pass::Still, ..Work::default() },
         format: PixelFormat::Rgb8,
         background,
         want_trace: false,
@@ -102,8 +101,8 @@ pub(crate) struct Drawn {
     pub(crate) encoded: Encoded,
     /// The message `done`.
     pub(crate) done: Value,
-    /// Milliseconds of drawing; `None` if the frame was there.
-    pub(crate) draw_ms: Option<f64>,
+    /// Milliseconds of drawing without those in which bricks came alone; `None` if the frame was there.
+    pub(crate) steady_ms: Option<f64>,
 }
 
 fn ms(since: Instant) -> f64 {
@@ -141,14 +140,17 @@ pub(crate) async fn draw(
     viewer: Viewer,
     asked_at: Instant,
 ) -> Result<Drawn, Problem> {
-    let Order { pair, pass, rung, request, codecs, frame } = order;
+    let Order { pair, pass, request, codecs, frame } = order;
     let (began, wait) = (Instant::now(), ms(asked_at));
     let was_there = frame.is_some();
     let frame = match frame {
         Some(frame) => frame,
         None => frame_of(&shared, &request, session, viewer).await?,
     };
+    // Bricks that had to be sent at first say nothing of the next frame.
+    let FrameMs { distribute, overlap, .. } = frame.stats.ms;
     let draw_ms = ms(began);
+    let steady_ms = (draw_ms - (distribute - overlap).max(0.0)).max(0.0);
     let encoding = Instant::now();
     let bound = if pass == Pass::Still { 0.0 } else { f32::NAN };
     let pixels = frame.clone();
@@ -160,14 +162,14 @@ pub(crate) async fn draw(
     let bytes: usize = encoded.tiles.iter().map(bytes::Bytes::len).sum();
     let mut done = json!({
         "type": "done", "seq": pair.seq, "scene": pair.scene, "pass": pass.name(),
-        "size": frame.size, "bytes": bytes, "rung": rung,
+        "size": frame.size, "bytes": bytes,
         "ms": {"wait": wait, "draw": draw_ms, "encode": ms(encoding), "total": ms(asked_at)},
     });
     if let Some(sha256) = &encoded.sha256 {
         done["sha256"] = sha256.as_str().into();
     }
     tell_statistics(&mut done, &frame.stats);
-    Ok(Drawn { frame, encoded, done, draw_ms: (!was_there).then_some(draw_ms) })
+    Ok(Drawn { frame, encoded, done, steady_ms: (!was_there).then_some(steady_ms) })
 }
 
 /// Adds what a page tells of a frame to its `done`.

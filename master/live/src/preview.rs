@@ -14,6 +14,9 @@ pub(crate) const SLOW_MS: f64 = 150.0;
 /// and CTs.
 const RATIO: f64 = 0.45;
 
+/// Where no rung fits, one that takes so much of the quickest one's time is as good.
+const HARDLY: f64 = 1.3;
+
 /// Passes in time after which a finer rung is tried.
 const GOOD_IN_A_ROW: u32 = 8;
 
@@ -76,11 +79,30 @@ impl Preview {
         self.took_ms[nearest].map(|took| took * RATIO.powi(steps))
     }
 
+    /// Returns the finest rung that takes hardly longer than the quickest: where none fits, being coarse
+    /// must gain something.
+    fn quickest(&self) -> usize {
+        let most = HARDLY * self.best_ms();
+        let is_quick = |rung: &usize| self.predicted(*rung).is_some_and(|ms| ms <= most);
+        (0..RUNGS.len()).find(is_quick).unwrap_or(RUNGS.len() - 1)
+    }
+
+    /// Returns the least milliseconds that any rung should take; infinity if nothing was measured.
+    fn best_ms(&self) -> f64 {
+        (0..RUNGS.len()).filter_map(|rung| self.predicted(rung)).fold(f64::INFINITY, f64::min)
+    }
+
     /// Returns the setting of the next moving pass, and its number on the ladder.
     pub(crate) fn choose(&mut self) -> (usize, Setting) {
         let fits = |rung: &usize| self.predicted(*rung).is_none_or(|ms| ms <= BUDGET_MS);
-        let finest = (0..RUNGS.len()).find(fits).unwrap_or(RUNGS.len() - 1);
-        let wanted = (finest + self.penalty).min(RUNGS.len() - 1);
+        let finest = (0..RUNGS.len()).find(fits).unwrap_or_else(|| self.quickest());
+        let mut wanted = (finest + self.penalty).min(RUNGS.len() - 1);
+        // What nobody measured is tried once: guesses from a rung that has its own overhead are too high.
+        let is_slow = self.predicted(finest).is_some_and(|ms| ms > BUDGET_MS);
+        if is_slow && self.good >= GOOD_IN_A_ROW && wanted > 0 && self.took_ms[wanted - 1].is_none()
+        {
+            wanted -= 1;
+        }
         if wanted > self.rung || self.good >= GOOD_IN_A_ROW || self.took_ms[self.rung].is_none() {
             self.good = 0;
             self.rung = wanted;
@@ -93,7 +115,8 @@ impl Preview {
         let took = &mut self.took_ms[rung];
         *took = Some(took.map_or(ms, |before| 0.5 * (before + ms)));
         if rung == self.rung {
-            self.good = if ms <= BUDGET_MS { self.good + 1 } else { 0 };
+            let most = BUDGET_MS.max(HARDLY * self.best_ms());
+            self.good = if ms <= most { self.good + 1 } else { 0 };
         }
     }
 
@@ -153,6 +176,18 @@ mod tests {
         assert!(takes[settled] <= BUDGET_MS && takes[settled - 1] > BUDGET_MS, "{rungs:?}");
         let changes = rungs.windows(2).filter(|pair| pair[0] != pair[1]).count();
         assert!(changes <= 4, "{rungs:?}");
+    }
+
+    #[test]
+    fn where_nothing_fits_coarse_passes_must_gain_something() {
+        let takes = [400.0, 200.0, 90.0, 50.0, 45.0, 44.0];
+        let mut preview = Preview::default();
+        let mut last = 0;
+        for _ in 0..90 {
+            (last, _) = preview.choose();
+            preview.drawn(last, takes[last]);
+        }
+        assert_eq!(last, 3, "50 ms are hardly more than 44");
     }
 
     #[test]

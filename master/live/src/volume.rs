@@ -131,6 +131,22 @@ pub(crate) fn framed(
     })
 }
 
+/// Returns the decimals to which numbers of a view are rounded whose picture is `height` high; below 0
+/// where tens do.
+fn rounding(height: f64) -> i32 {
+    -((height.max(f64::MIN_POSITIVE) * 1e-4).log10().floor() as i32)
+}
+
+/// Returns the number nearest to `x` with so many decimals, as its text is read.
+fn rounded(x: f64, decimals: i32) -> f64 {
+    if decimals >= 0 {
+        let text = format!("{x:.*}", decimals.min(300) as usize);
+        return text.parse().unwrap_or(x) + 0.0;
+    }
+    let unit = 10f64.powi(-decimals);
+    (x / unit).round() * unit
+}
+
 /// What a master shows first.
 #[derive(Clone, Debug, Default)]
 pub struct Home {
@@ -173,6 +189,11 @@ pub(crate) fn describe(
         Some(framing) => (framing.target, framing.height),
         None => (lattice.centre().to_array(), 1.25 * extent),
     };
+    // Short numbers for command lines and addresses: a ten-thousandth of the picture is no pixel.
+    let digits = rounding(height);
+    let short = |x: f64| rounded(x, digits);
+    let target = target.map(short);
+    let height = if short(height) > 0.0 { short(height) } else { height };
     let camera = Key { target: Some(target), height: Some(height), ..key };
     let (from, to, counts) = histogram(info);
     let (lowest, highest) = summary.range();
@@ -207,4 +228,20 @@ pub(crate) fn describe(
         home_tf: TransferChoice::Name(preset.into()),
         message: Arc::new(message),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn home_views_have_short_numbers() {
+        let decimals = rounding(265.882_352_977_647_1);
+        assert_eq!(decimals, 2);
+        assert_eq!(rounded(133.991_509_318_351_75, decimals), 133.99);
+        assert_eq!(rounded(143.000_000_015_5, decimals), 143.0);
+        assert_eq!(rounded(0.012_345, rounding(0.5)), 0.012_35);
+        assert_eq!(rounded(123_456.0, rounding(5e7)), 123_000.0);
+        assert_eq!(rounded(-0.000_1, 2).to_string(), "0");
+    }
 }

@@ -215,8 +215,8 @@ impl ActiveJobs {
             let is_batch = !self.peer_of.get(&id).is_some_and(|peer| peer.is_live());
             Some(((is_batch, work, active.turn()), next(id, active)?))
         });
-        let mut candidates: Vec<((bool, Option<u64>, u32), Candidate)> = jobs.collect();
-        candidates.sort_by_key(|(turn, candidate)| (*turn, !candidate.wanted));
+        let mut candidates: Vec<_> = jobs.collect();
+        candidates.sort_by_key(|(turn, candidate): &(_, Candidate)| (*turn, !candidate.wanted));
         candidates.into_iter().map(|(_, candidate)| candidate).collect()
     }
 

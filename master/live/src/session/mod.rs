@@ -52,6 +52,9 @@ const MOST_QUEUED: usize = 4096;
 const RATE: f64 = 500.0;
 const BURST: f64 = 1000.0;
 
+/// Number of the notice that no worker is there.
+const NO_WORKER: u32 = 1;
+
 /// Close codes of docs/reference/live.md.
 pub(crate) mod code {
     pub(crate) const GOING: u16 = 1001;
@@ -119,7 +122,7 @@ struct Session {
     asked_at: Instant,
     drawing: Option<Drawing>,
     passes: u64,
-    /// The last frame in all detail, and its request: a still of it need not be drawn again.
+    /// The last still, and its request: the same again need not be drawn.
     frame: Option<(PathRequest, Arc<FinishedFrame>)>,
     /// When passes were sent, for the pace.
     sent: VecDeque<(Pair, Pass, Instant)>,
@@ -131,6 +134,12 @@ struct Session {
     watched: Vec<String>,
     news: crate::news::News,
     news_asked: bool,
+    /// Render threads of all workers, as the last news had them.
+    threads: u32,
+    /// Whether the client was told that no worker is there.
+    lacks_worker: bool,
+    /// Whether the client was told that its quality is not drawn.
+    told_quality: bool,
 }
 
 /// Makes a text message.
@@ -264,6 +273,9 @@ async fn begin(
         watched: Vec::new(),
         news: Default::default(),
         news_asked: false,
+        threads: 0,
+        lacks_worker: false,
+        told_quality: false,
         shared: shared.clone(),
     };
     Ok((session, hello))
@@ -424,6 +436,7 @@ impl Session {
             Outcome::Drawn { number, result } => self.drawn(number, result),
             Outcome::News(snapshot) => {
                 self.news_asked = false;
+                self.tell_workers(snapshot.threads);
                 for message in self.news.changes(snapshot) {
                     self.say(&message);
                 }
@@ -441,6 +454,24 @@ impl Session {
 
     fn any_volume_is_there(&self) -> bool {
         !self.shared.handle.library().list(self.viewer).is_empty()
+    }
+
+    /// Tells when the last worker left, and when one is there again.
+    fn tell_workers(&mut self, threads: u32) {
+        self.threads = threads;
+        let has_worker = threads > 0;
+        if std::mem::replace(&mut self.lacks_worker, !has_worker) != has_worker {
+            return;
+        }
+        if has_worker {
+            self.say(&json!({"type": "notice_over", "id": NO_WORKER}));
+            return;
+        }
+        self.say(&json!({
+            "type": "notice", "level": "warning", "until": "over", "id": NO_WORKER,
+            "text": "No worker is there, so the picture stays as it is.",
+            "remedy": "Start one: slabcast worker --master HOST:PORT",
+        }));
     }
 
     /// Watches other things, and has their present state told.
@@ -565,6 +596,7 @@ impl Session {
                     self.preview.scene_changed();
                 }
                 self.edited = scene.moving;
+                self.tell_quality(&scene);
                 self.scene = scene;
                 self.changed();
             }
@@ -585,6 +617,18 @@ impl Session {
             _ => self.ask(head, text)?,
         }
         Ok(())
+    }
+
+    /// Tells once that live pictures have one quality.
+    fn tell_quality(&mut self, scene: &Scene) {
+        if scene.quality.is_usual() || std::mem::replace(&mut self.told_quality, true) {
+            return;
+        }
+        self.say(&json!({
+            "type": "notice", "level": "info", "until": "dismissed",
+            "text": "This master shows pictures in the usual quality.",
+            "remedy": "The command line that the page gives draws in the quality that you chose.",
+        }));
     }
 
     fn acknowledged(&mut self, ack: &Ack) {
@@ -635,13 +679,12 @@ impl Session {
         self.drop_thumb();
         let rung = if pass == Pass::Moving { self.preview.choose().0 } else { 0 };
         let edited = self.edited && pass == Pass::Moving;
-        let request = request_of(shown, &self.view, &self.scene, rung, edited);
+        let request = request_of(shown, &self.view, &self.scene, (pass, rung), edited);
         let known = self.frame.as_ref().filter(|(of, _)| *of == request);
         let frame = known.map(|(_, frame)| frame.clone());
         self.passes += 1;
         let number = self.passes;
-        let order =
-            Order { pair, pass, rung, request: request.clone(), codecs: self.codecs, frame };
+        let order = Order { pair, pass, request: request.clone(), codecs: self.codecs, frame };
         let (shared, id, viewer, asked_at) =
             (self.shared.clone(), self.id, self.viewer, self.asked_at);
         let task = self.tasks.spawn(async move {
@@ -657,7 +700,7 @@ impl Session {
             return;
         };
         let Drawing { pair, pass, rung, request, .. } = drawing;
-        let Drawn { frame, encoded, mut done, draw_ms } = match result {
+        let Drawn { frame, encoded, mut done, steady_ms } = match result {
             Ok(drawn) => *drawn,
             Err(problem) => {
                 self.slot.failed();
@@ -665,13 +708,11 @@ impl Session {
                 return;
             }
         };
-        if let Some(object) = done.as_object_mut() {
-            object.remove("rung");
-        }
-        if let Some(ms) = draw_ms {
+        done["threads"] = self.threads.into();
+        if let Some(ms) = steady_ms {
             self.preview.drawn(rung, ms);
         }
-        if rung == 0 {
+        if pass == Pass::Still {
             self.frame = Some((request, frame));
         }
         let tiles = encoded.tiles.into_iter().map(Message::Binary);

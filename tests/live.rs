@@ -28,6 +28,15 @@ struct Page {
 
 impl Drop for Page {
     fn drop(&mut self) {
+        // In order, so that its folder goes too.
+        let id = self.process.id().to_string();
+        let _ = Command::new("kill").args(["-INT", &id]).status();
+        for _ in 0..200 {
+            if matches!(self.process.try_wait(), Ok(Some(_))) {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
         let _ = self.process.kill();
         let _ = self.process.wait();
     }
@@ -471,6 +480,44 @@ async fn tokens_are_asked_for_in_the_first_message_and_in_calls() {
     assert_eq!(page.call("GET", "/v1/states/x", "", b"").0, 401);
     let bearer = "Authorization: Bearer a-long-enough-token\r\n";
     assert_eq!(page.call("GET", "/v1/states/x", bearer, b"").0, 404);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn live_pictures_come_beside_a_job_which_goes_on() {
+    let page = view(&["--tf", "skin"]);
+    let mut session = page.session(json!({"watch": ["jobs"]})).await;
+    session.still(0).await;
+    let movie = json!({"version": 1, "volume": {"name": VOLUME}, "tf": "fog", "format": "zip",
+        "fps": 10, "path": {"version": 1, "size": [256, 256],
+        "turntable": {"start": 0, "step": 1, "frames": 300}}});
+    let (status, answer) = page.post("/v1/movie", &movie);
+    assert_eq!(status, 202, "{answer}");
+    let mut begun = 0;
+    while begun < 3 {
+        let news = session.until("jobs").await;
+        let entries = news["changed"].as_array().expect("entries");
+        assert!(
+            entries.iter().all(|entry| entry["job"] == answer["job"]),
+            "live jobs are nobody's"
+        );
+        begun = entries.first().and_then(|job| job["frames_done"].as_u64()).unwrap_or(begun);
+    }
+    for seq in 1..=20u64 {
+        let camera = camera(seq as f64 * 7.0);
+        session.send(json!({"type": "view", "seq": seq, "camera": camera, "size": SIZE})).await;
+        session.still(seq).await;
+    }
+    // The job is not over: else the pictures came behind it. A time would tell of the machine.
+    let last = loop {
+        let news = session.until("jobs").await;
+        if let Some(job) = news["changed"].as_array().and_then(|jobs| jobs.first()) {
+            break job.clone();
+        }
+    };
+    assert_eq!((&last["state"], &last["frames_total"]), (&json!("running"), &json!(300)), "{last}");
+    assert!(last["frames_done"].as_u64().is_some_and(|n| n > begun), "it goes on: {last}");
+    session.send(json!({"type": "cancel_job", "id": 5, "job": answer["job"]})).await;
+    assert_eq!(session.until("ok").await["id"], 5);
 }
 
 #[tokio::test(flavor = "multi_thread")]

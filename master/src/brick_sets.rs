@@ -181,13 +181,13 @@ mod tests {
 
     #[test]
     fn set_of_a_frame_in_flight_and_a_fresh_set_that_is_needed_stay() {
-        let stores: Vec<_> = (0..4u8).map(set).collect();
+        let stores: Vec<_> = (0..=KEPT as u8).map(set).collect();
         let mut sets = BrickSets::new(u64::MAX);
         for store in &stores[..KEPT] {
             assert!(sets.begin_cut(store.key(), 1, 0, |_| false, |_| true));
             sets.cut(store.clone(), 0);
         }
-        let key = stores[3].key();
+        let key = stores[KEPT].key();
         assert!(!sets.begin_cut(key, 1, STAYS - 1, |_| false, |_| true), "all are fresh");
         assert!(!sets.begin_cut(key, 1, STAYS, |_| true, |_| true), "all are drawn from");
         let first = stores[0].key();

@@ -54,7 +54,7 @@ pub(crate) enum Event {
     Submit {
         plan: Box<Plan>,
         submitter: Submitter,
-        reply: oneshot::Sender<Result<JobId, SubmitError>>,
+        reply: oneshot::Sender<Result<Admitted, SubmitError>>,
     },
     /// A brick set was cut.
     BricksCut { set: BrickSetKey, store: Result<Arc<BrickStore>, String> },
@@ -74,6 +74,35 @@ pub(crate) enum Event {
     Workers { reply: oneshot::Sender<Vec<Worker>> },
     /// The master ends.
     Shutdown,
+}
+
+/// A job that was taken.
+pub(crate) struct Admitted {
+    pub(crate) job: JobId,
+    /// Of a live session's job: ends it when whoever asked is gone, at whatever moment.
+    pub(crate) guard: Option<Forgets>,
+}
+
+/// Has the driver forget a job when it is dropped.
+pub(crate) struct Forgets {
+    job: JobId,
+    inbox: mpsc::Sender<Event>,
+}
+
+impl Drop for Forgets {
+    fn drop(&mut self) {
+        let event = Event::Forget { job: self.job };
+        let Err(mpsc::error::TrySendError::Full(event)) = self.inbox.try_send(event) else {
+            return;
+        };
+        // The driver is busy; it is told as soon as it has room.
+        let inbox = self.inbox.clone();
+        if let Ok(runtime) = tokio::runtime::Handle::try_current() {
+            runtime.spawn(async move {
+                let _ = inbox.send(event).await;
+            });
+        }
+    }
 }
 
 struct RealClock(Instant);
@@ -255,7 +284,13 @@ impl Driver {
                 }
             }
             Event::Submit { plan, submitter, reply } => {
-                let _ = reply.send(self.submit(*plan, submitter));
+                let admitted = self.submit(*plan, submitter).map(|job| {
+                    let inbox = self.inbox.clone();
+                    let guard = submitter.is_live().then(|| Forgets { job, inbox });
+                    Admitted { job, guard }
+                });
+                // Of a client that is gone a live job is forgotten.
+                let _ = reply.send(admitted);
             }
             Event::BricksCut { set, store } => self.bricks_cut(set, store),
             Event::BricksLost { worker, set, bricks, reason } => {

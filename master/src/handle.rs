@@ -1,7 +1,7 @@
 //! Starting a master, and the handle by which links, services and embedding programs speak to it.
 
 use crate::admission::{AttachError, Audits, WorkerTable};
-use crate::driver::{Driver, Event};
+use crate::driver::{Admitted, Driver, Event, Forgets};
 use crate::finishers::Finishers;
 use crate::hooks::{Hooks, Stage};
 use crate::jobs::active::Submitter;
@@ -189,7 +189,7 @@ impl Handle {
         Viewer::at(peer, self.show_names)
     }
 
-    /// Runs what may read a volume's file, on a blocking thread; at most [`PLANS_AT_ONCE`] run at a
+    /// Runs what may read a volume's file, on a blocking thread; at most two run at a
     /// time. `None` if the master is gone.
     pub async fn reading<T: Send + 'static>(
         &self,
@@ -199,7 +199,7 @@ impl Handle {
     }
 
     /// Runs what looks at folders or writes a piece of an upload, on a blocking thread; at most
-    /// [`LOOKS_AT_ONCE`] run at a time. `None` if the master is gone.
+    /// four run at a time. `None` if the master is gone.
     pub async fn looking<T: Send + 'static>(
         &self,
         run: impl FnOnce(&Library) -> T + Send + 'static,
@@ -253,7 +253,8 @@ impl Handle {
         request: PathRequest,
         peer: Option<IpAddr>,
     ) -> Result<JobId, SubmitError> {
-        self.submit_for(request, Submitter::Batch(peer.map(counted_as)), self.viewer(peer)).await
+        let submitter = Submitter::Batch(peer.map(counted_as));
+        self.submit_for(request, submitter, self.viewer(peer)).await.map(|admitted| admitted.job)
     }
 
     /// Submits a path of one frame for a live session, which is a number that no other session has.
@@ -268,9 +269,10 @@ impl Handle {
         session: u64,
         viewer: Viewer,
     ) -> Result<Drawing, SubmitError> {
-        let job = self.submit_for(request, Submitter::Live(session), viewer).await?;
+        let Admitted { job, guard } =
+            self.submit_for(request, Submitter::Live(session), viewer).await?;
         let watch = Watch::new(self.jobs.clone(), job, 0, self.inbox.clone());
-        Ok(Drawing { job, watch: Some(watch), inbox: self.inbox.clone() })
+        Ok(Drawing { watch, _guard: guard })
     }
 
     async fn submit_for(
@@ -278,7 +280,7 @@ impl Handle {
         request: PathRequest,
         submitter: Submitter,
         viewer: Viewer,
-    ) -> Result<JobId, SubmitError> {
+    ) -> Result<Admitted, SubmitError> {
         let peer = submitter.peer();
         check_key(&request.client_key)?;
         if let Some(job) = self.jobs.lock().by_key(&request.client_key) {
@@ -286,7 +288,7 @@ impl Handle {
                 return Err(SubmitError::KeyTaken);
             }
             if !job.may_retry() {
-                return Ok(job.view.id);
+                return Ok(Admitted { job: job.view.id, guard: None });
             }
         }
         // Whom the driver would turn away costs no check.
@@ -393,9 +395,9 @@ impl Handle {
 /// A picture that is being drawn for a live session, from [`Handle::draw`]. Dropped, it is drawn no
 /// further.
 pub struct Drawing {
-    job: JobId,
-    watch: Option<Watch>,
-    inbox: mpsc::Sender<Event>,
+    // Dropped first: the watcher tells the table that it holds no frame.
+    watch: Watch,
+    _guard: Option<Forgets>,
 }
 
 impl Drawing {
@@ -404,9 +406,8 @@ impl Drawing {
     /// # Errors
     /// It can't be drawn, for a reason in words.
     pub async fn finished(&mut self) -> Result<Arc<FinishedFrame>, String> {
-        let Some(watch) = &mut self.watch else { return Err("it was taken before".into()) };
         loop {
-            match watch.next().await {
+            match self.watch.next().await {
                 Some(WatchItem::Frame(frame)) => return Ok(frame),
                 Some(WatchItem::Failed { reason, .. }) => return Err(reason.to_string()),
                 Some(WatchItem::Notice(view)) => match view.state {
@@ -416,24 +417,6 @@ impl Drawing {
                 },
                 None => return Err("the master ended".into()),
             }
-        }
-    }
-}
-
-impl Drop for Drawing {
-    fn drop(&mut self) {
-        // The watcher tells the table first that it holds no frame.
-        self.watch = None;
-        let event = Event::Forget { job: self.job };
-        let Err(mpsc::error::TrySendError::Full(event)) = self.inbox.try_send(event) else {
-            return;
-        };
-        // The driver is busy; it is told as soon as it has room.
-        let inbox = self.inbox.clone();
-        if let Ok(runtime) = tokio::runtime::Handle::try_current() {
-            runtime.spawn(async move {
-                let _ = inbox.send(event).await;
-            });
         }
     }
 }

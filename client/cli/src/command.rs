@@ -76,7 +76,7 @@ pub(crate) const GROUPS: [(&str, &[&str]); 4] = [
 ];
 
 /// Commands that the short help only names: it has to fit a screen of 24 lines.
-const ALSO: [&str; 7] = ["rerender", "volumes", "put", "rm", "completions", "man", "help"];
+const ALSO: [&str; 8] = ["rerender", "tf", "volumes", "put", "rm", "completions", "man", "help"];
 
 const EXAMPLES: &str = "\
 Examples:

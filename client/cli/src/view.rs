@@ -23,7 +23,9 @@ use tokio::sync::watch;
 /// Bytes that files dropped on the page may take on disk.
 const UPLOADS: u64 = 16 << 30;
 
-/// Shows a volume in a web browser, to turn, colour and cut it.
+/// Shows a volume in a web browser.
+///
+/// To turn, colour and cut it with the mouse, and to take pictures, movies and commands from there.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:

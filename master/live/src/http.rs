@@ -234,6 +234,10 @@ async fn picture(shared: &Shared, caller: Caller, body: &[u8], format: &str) -> 
         let text = format!("has {} frames; give one, or POST v1/movie", document.path.frames());
         return Err(invalid("path.frames", text));
     }
+    let Ok(_place) = shared.pictures.try_acquire() else {
+        let text = "other pictures are being made, as many as this master makes at a time; wait";
+        return Err(Problem { retry_ms: Some(2000), ..Problem::new("busy", text) });
+    };
     let Opened { open, mut recipe, request } = open(shared, caller, document, format, None).await?;
     let viewer = shared.handle.viewer(Some(caller.peer.ip()));
     if request.path.wants_framing() {

@@ -132,7 +132,7 @@ pub(crate) fn picked(
         if sigma <= 0.0 {
             continue;
         }
-        let share = left * (1.0 - (-sigma * STEP).exp());
+        let share = left * (1.0 - libm::exp(-sigma * STEP));
         seen.push(Seen { code, share, rgb: [r, g, b] });
         left -= share;
         stopped.push((1.0 - left, z, index, code));
@@ -162,7 +162,7 @@ pub(crate) fn picked(
 fn ranges(seen: &[Seen], alpha: f64, value: impl Fn(f64) -> f64) -> Vec<Value> {
     let codes = seen.iter().map(|s| s.code);
     let (lo, hi) = codes.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), c| (a.min(c), b.max(c)));
-    if !(lo <= hi) || alpha <= 0.0 {
+    if seen.is_empty() || alpha <= 0.0 {
         return Vec::new();
     }
     let width = ((hi - lo) / BINS as f64).max(f64::MIN_POSITIVE);

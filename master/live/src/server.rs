@@ -8,7 +8,7 @@ use crate::files::Files;
 use crate::http;
 use crate::problem::Problem;
 use crate::session;
-use crate::shared::{LiveConfig, Shared};
+use crate::shared::{LiveConfig, SESSIONS, Shared};
 use axum::body::{Body, to_bytes};
 use axum::extract::FromRequestParts;
 use axum::extract::ws::WebSocketUpgrade;
@@ -20,12 +20,13 @@ use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use serde_json::Value;
 use slabcast_master::Handle;
-use slabcast_master::serve::PageConnection;
+use slabcast_master::serve::{PageConnection, counted_as};
+use std::collections::BTreeMap;
 use std::convert::Infallible;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::{Semaphore, mpsc, watch};
+use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tracing::debug;
 
@@ -38,14 +39,19 @@ const BODY: Duration = Duration::from_secs(60);
 /// Connections of browsers at a time. A page has a socket and up to six others.
 const CONNECTIONS: usize = 512;
 
+/// Connections of browsers at one address at a time: those of some twenty pages. One that reads nothing
+/// keeps its place, so nobody may have all.
+const CONNECTIONS_OF_PEER: usize = 128;
+
 /// Bytes of a request's head.
 const HEAD_BYTES: usize = 32 << 10;
 
 /// Time that connections may take to end when the master does.
 const GOODBYE: Duration = Duration::from_secs(2);
 
-/// Bytes of the longest message that is read at all: of one that is too long the session tells.
-const SOCKET_BYTES: usize = 256 << 10;
+/// Bytes of the longest message that is read at all: of one that is too long the session tells, and only
+/// of one that was read can it.
+const SOCKET_BYTES: usize = 2 << 20;
 
 /// An answer, or a refusal.
 pub(crate) type Answer = Result<Response, Problem>;
@@ -60,27 +66,42 @@ pub async fn serve(
     mut stop: watch::Receiver<bool>,
 ) {
     let shared = Arc::new(Shared::new(handle, config, files, stop.clone()));
-    let places = Arc::new(Semaphore::new(CONNECTIONS));
+    let mut of_peers: BTreeMap<IpAddr, usize> = BTreeMap::new();
     let mut open = JoinSet::new();
     loop {
         let connection = tokio::select! {
             connection = connections.recv() => connection,
-            Some(_) = open.join_next() => continue,
+            Some(ended) = open.join_next() => {
+                // A connection that panicked keeps its place; none does.
+                if let Ok(peer) = ended
+                    && let Some(own) = of_peers.get_mut(&peer)
+                {
+                    *own -= 1;
+                    of_peers.retain(|_, own| *own > 0);
+                }
+                continue;
+            }
             () = stopped(&mut stop) => break,
         };
         let Some(connection) = connection else { break };
-        let Ok(place) = places.clone().try_acquire_owned() else {
+        let peer = counted_as(connection.peer().ip());
+        let own = of_peers.entry(peer).or_default();
+        if open.len() >= CONNECTIONS || *own >= CONNECTIONS_OF_PEER {
             debug!(from = %connection.peer(), "page's connection turned away: too many");
             continue;
-        };
+        }
+        *own += 1;
         let (shared, stop) = (shared.clone(), stop.clone());
         open.spawn(async move {
-            let _place = place;
             talk(shared, connection, stop).await;
+            peer
         });
     }
     let ended = async { while open.join_next().await.is_some() {} };
     let _ = tokio::time::timeout(GOODBYE, ended).await;
+    // Sessions say goodbye.
+    let all = shared.sessions.acquire_many(SESSIONS as u32);
+    let _ = tokio::time::timeout(GOODBYE, all).await;
 }
 
 /// Answers the requests of one connection.

@@ -16,6 +16,9 @@ pub(crate) const LIVE_PIXELS: u64 = 4 << 20;
 /// Sessions at a time.
 pub(crate) const SESSIONS: usize = 64;
 
+/// Pictures to keep that are made at a time: one of 8192x8192 takes 0.5 GiB.
+const PICTURES: usize = 4;
+
 /// Settings of a master's page.
 #[derive(Clone, Debug, Default)]
 pub struct LiveConfig {
@@ -37,6 +40,8 @@ pub(crate) struct Shared {
     pub(crate) config: LiveConfig,
     pub(crate) guard: Guard,
     pub(crate) sessions: Arc<Semaphore>,
+    /// Places of pictures to keep that are drawn and written now.
+    pub(crate) pictures: Semaphore,
     pub(crate) stop: watch::Receiver<bool>,
     pub(crate) files: Arc<dyn Files>,
     pub(crate) states: crate::http::States,
@@ -58,6 +63,7 @@ impl Shared {
             handle,
             config,
             sessions: Arc::new(Semaphore::new(SESSIONS)),
+            pictures: Semaphore::new(PICTURES),
             stop,
             files,
             states: Default::default(),

@@ -134,7 +134,7 @@ pub(crate) fn framed(
 /// Returns the decimals to which numbers of a view are rounded whose picture is `height` high; below 0
 /// where tens do.
 fn rounding(height: f64) -> i32 {
-    -((height.max(f64::MIN_POSITIVE) * 1e-4).log10().floor() as i32)
+    -(libm::log10(height.max(f64::MIN_POSITIVE) * 1e-4).floor() as i32)
 }
 
 /// Returns the number nearest to `x` with so many decimals, as its text is read.

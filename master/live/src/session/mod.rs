@@ -41,12 +41,21 @@ const PING: Duration = Duration::from_secs(20);
 /// Time after which a socket that takes no byte is given up.
 const STUCK: Duration = Duration::from_secs(60);
 
+/// Time for a client to take the close code and close.
+const FAREWELL: Duration = Duration::from_secs(1);
+
 /// Messages that wait for the socket's writer. Others wait in the session's own queue, where those
 /// of an old pass can be dropped.
 const WRITING: usize = 4;
 
 /// Messages of any kind that wait in the session's queue before it is given up.
 const MOST_QUEUED: usize = 4096;
+
+/// Messages that wait to be written beyond which no news is looked for.
+const NEWS_WAITING: usize = 8;
+
+/// Requests of a page that are answered at a time, its pictures included.
+const MOST_TASKS: usize = 32;
 
 /// Messages a second that a client may send, and at once.
 const RATE: f64 = 500.0;
@@ -70,8 +79,8 @@ struct End(u16, String);
 
 /// What a task of a session brings.
 pub(super) enum Outcome {
-    /// A volume was opened, or not. `hello`: in answer to the first message.
-    Opened { hello: bool, id: u64, result: Result<Box<Shown>, Problem>, then: Option<Box<First>> },
+    /// A volume was opened, or not.
+    Opened { open: Box<Opening>, result: Result<Option<Box<Shown>>, Problem> },
     /// A pass was drawn. `number`: which.
     Drawn { number: u64, result: Result<Box<Drawn>, Problem> },
     /// The present state of what is watched.
@@ -82,8 +91,20 @@ pub(super) enum Outcome {
     Say(Vec<Message>),
 }
 
+/// A volume that is being opened.
+pub(super) struct Opening {
+    /// Newer ones have higher numbers.
+    number: u64,
+    /// Name that was asked for; `None`: the master's own, or its first.
+    name: Option<String>,
+    /// Whether in answer to the first message.
+    hello: bool,
+    id: u64,
+    then: First,
+}
+
 /// View and scene that come with a volume.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub(super) struct First {
     view: Option<View>,
     scene: Option<Scene>,
@@ -111,7 +132,9 @@ struct Session {
     viewer: Viewer,
     codecs: Codecs,
     shown: Option<Arc<Shown>>,
-    opening: bool,
+    /// Number of the volume that is being opened.
+    opening: Option<u64>,
+    opened: u64,
     size: [u32; 2],
     view: View,
     scene: Scene,
@@ -176,8 +199,12 @@ pub(crate) async fn run(shared: Arc<Shared>, socket: WebSocket, peer: Option<IpA
         let _ = tokio::time::timeout(Duration::from_secs(1), to_writer.send(close)).await;
     }
     drop(to_writer);
+    // What the client still sends is read: a socket that is closed over unread bytes is reset, and the
+    // close code is lost on its way.
+    let rest = async { while let Some(Ok(_)) = stream.next().await {} };
+    let _ = tokio::time::timeout(FAREWELL, rest).await;
     // The writer ends when it has written, or is stuck.
-    let _ = tokio::time::timeout(Duration::from_secs(2), writer).await;
+    let _ = tokio::time::timeout(FAREWELL, writer).await;
 }
 
 /// Writes messages to the socket until there are no more, and pings.
@@ -253,7 +280,8 @@ async fn begin(
         viewer: shared.handle.viewer(peer),
         codecs: Codecs { jpeg: takes("jpeg"), webp: takes("webp") },
         shown: None,
-        opening: false,
+        opening: None,
+        opened: 0,
         size: hello.size,
         view: View { seq: 0, camera: Default::default(), size: hello.size, moving: false },
         scene: Scene::home(0),
@@ -300,10 +328,10 @@ impl Session {
         stream: &mut SplitStream<WebSocket>,
         writer: &mpsc::Sender<Message>,
     ) -> End {
-        self.welcome();
+        self.welcome().await;
         self.watch(hello.watch);
         let first = First { view: hello.view, scene: hello.scene };
-        self.open(hello.volume, true, 0, Some(first));
+        self.open(hello.volume, true, 0, first);
         let mut allowance = (BURST, Instant::now());
         let mut stop = self.shared.stop.clone();
         let mut news = tokio::time::interval(crate::news::EVERY);
@@ -378,8 +406,9 @@ impl Session {
         self.say(&problem.message(re, id));
     }
 
-    fn welcome(&mut self) {
-        let shared = self.shared.clone();
+    async fn welcome(&mut self) {
+        let (shared, viewer) = (self.shared.clone(), self.viewer);
+        let listed = shared.handle.looking(move |library| library.list(viewer).is_empty()).await;
         let limits = json!({
             "live_edge": LIVE_EDGE, "live_pixels": LIVE_PIXELS,
             "picture_edge": crate::http::PICTURE_EDGE, "upload_bytes": crate::http::UPLOAD_BYTES,
@@ -395,42 +424,43 @@ impl Session {
             "type": "welcome", "protocol": 1, "server": name,
             "version": env!("CARGO_PKG_VERSION"),
             "pixels_version": slabcast_common::PIXELS_VERSION, "now_ms": unix_ms(),
-            "empty": shared.handle.library().list(self.viewer).is_empty(),
+            "empty": listed.unwrap_or(true),
             "roles": ["view", "submit", "upload", "cancel"],
             "movies": shared.files.movies(), "limits": limits,
         }));
     }
 
-    /// Has a volume opened on a thread of its own.
-    fn open(&mut self, name: Option<String>, hello: bool, id: u64, then: Option<First>) {
-        self.opening = true;
+    /// Has a volume opened on a thread of its own. It replaces one that is being opened.
+    fn open(&mut self, name: Option<String>, hello: bool, id: u64, then: First) {
+        self.opened += 1;
+        self.opening = Some(self.opened);
+        let open = Box::new(Opening { number: self.opened, name, hello, id, then });
         let (shared, viewer, size) = (self.shared.clone(), self.viewer, self.size);
         self.tasks.spawn(async move {
-            let choice = match name.clone() {
-                Some(name) => VolumeChoice::Name(name),
-                None => VolumeChoice::Default,
-            };
-            let result = opened(&shared, choice, viewer, size).await;
-            Outcome::Opened { hello, id, result: result.map(Box::new), then: then.map(Box::new) }
+            let result = opened(&shared, open.name.clone(), viewer, size).await;
+            Outcome::Opened { open, result: result.map(|shown| shown.map(Box::new)) }
         });
     }
 
     fn finish(&mut self, outcome: Outcome) {
         match outcome {
-            Outcome::Opened { hello, id, result: Ok(shown), then } => {
-                self.opened(*shown, then.map(|then| *then), hello, id);
-            }
-            Outcome::Opened { hello, id, result: Err(problem), then } => {
-                self.opening = false;
-                let re = if hello { "hello" } else { "open" };
-                // A master without volumes waits for the first.
-                if hello && !self.any_volume_is_there() {
-                    return;
-                }
-                self.refuse(&problem, re, id);
-                if hello && then.is_some() && self.shown.is_none() {
-                    // Its own volume, and the home view.
-                    self.open(self.any_volume(), true, 0, None);
+            Outcome::Opened { open, .. } if self.opening != Some(open.number) => {}
+            Outcome::Opened { open, result } => {
+                self.opening = None;
+                match result {
+                    Ok(Some(shown)) => self.show(*shown, *open),
+                    // A master without volumes waits for the first.
+                    Ok(None) => {}
+                    Err(problem) => {
+                        let re = if open.hello { "hello" } else { "open" };
+                        self.refuse(&problem, re, open.id);
+                        if self.shown.is_none() && open.name.is_some() {
+                            // Its own volume, and the home view.
+                            self.open(None, true, 0, First::default());
+                        }
+                        // Views that came meanwhile are of the volume that stays.
+                        self.changed();
+                    }
                 }
             }
             Outcome::Drawn { number, result } => self.drawn(number, result),
@@ -440,8 +470,8 @@ impl Session {
                 for message in self.news.changes(snapshot) {
                     self.say(&message);
                 }
-                if self.shown.is_none() && !self.opening && self.any_volume_is_there() {
-                    self.open(self.any_volume(), true, 0, None);
+                if self.shown.is_none() && self.opening.is_none() {
+                    self.open(None, true, 0, First::default());
                 }
             }
             Outcome::Thumb { id, result } => self.thumb_drawn(id, result),
@@ -450,10 +480,6 @@ impl Session {
                 self.queue.extend(queued);
             }
         }
-    }
-
-    fn any_volume_is_there(&self) -> bool {
-        !self.shared.handle.library().list(self.viewer).is_empty()
     }
 
     /// Tells when the last worker left, and when one is there again.
@@ -483,7 +509,9 @@ impl Session {
 
     /// Has the present state of what is watched looked at, unless that is under way.
     fn ask_news(&mut self) {
-        if self.news_asked {
+        // A client that reads slowly gets the state of the moment at which it has read.
+        let waiting = self.queue.iter().filter(|queued| queued.pass.is_none()).count();
+        if self.news_asked || waiting > NEWS_WAITING {
             return;
         }
         self.news_asked = true;
@@ -493,17 +521,9 @@ impl Session {
         });
     }
 
-    /// Returns the first volume that can be read; `None`: the master's own.
-    fn any_volume(&self) -> Option<String> {
-        if self.shared.handle.library().default_volume().is_some() {
-            return None;
-        }
-        let listed = self.shared.handle.library().list(self.viewer);
-        listed.into_iter().find(|entry| entry.problem.is_empty()).map(|entry| entry.name)
-    }
-
-    fn opened(&mut self, shown: Shown, then: Option<First>, hello: bool, id: u64) {
-        self.opening = false;
+    /// Shows a volume that was opened.
+    fn show(&mut self, shown: Shown, open: Opening) {
+        let Opening { hello, id, then: First { view, scene }, .. } = open;
         self.drop_pass();
         self.drop_thumb();
         self.slot.clear();
@@ -512,7 +532,6 @@ impl Session {
         self.say(&shown.message);
         let shown = Arc::new(shown);
         self.shown = Some(shown.clone());
-        let First { view, scene } = then.unwrap_or(First { view: None, scene: None });
         let re = if hello { "hello" } else { "open" };
         // The home view has the numbers of the latest view and scene.
         let (seq, size) = (self.view.seq, self.size);
@@ -540,7 +559,7 @@ impl Session {
     fn changed(&mut self) {
         self.asked_at = Instant::now();
         let is_moving = self.view.moving || self.scene.moving;
-        if self.shown.is_some() && !self.opening {
+        if self.shown.is_some() && self.opening.is_none() {
             self.slot.change(self.pair(), is_moving, self.shared.now());
             self.withdraw_old_still();
         }
@@ -608,11 +627,15 @@ impl Session {
             "open" => {
                 let Open { volume, scene, view } = read(text)?;
                 let then = First { view, scene };
-                self.open(Some(volume), false, head.id(), Some(then));
+                self.open(Some(volume), false, head.id(), then);
             }
             "watch" => {
                 let WatchAsk { of } = read(text)?;
                 self.watch(of);
+            }
+            _ if self.tasks.len() >= MOST_TASKS => {
+                let busy = "as many requests as a page may have are being answered; wait";
+                return Err(Problem::new("busy", busy));
             }
             _ => self.ask(head, text)?,
         }
@@ -654,7 +677,7 @@ impl Session {
     /// Begins and drops passes until there is nothing to do now. Returns for what to wait.
     fn advance(&mut self) -> Step {
         loop {
-            let Some(shown) = self.shown.clone().filter(|_| !self.opening) else {
+            let Some(shown) = self.shown.clone().filter(|_| self.opening.is_none()) else {
                 return Step::Wait(None);
             };
             match self.slot.step(self.preview.is_slow(), self.shared.now()) {
@@ -729,18 +752,30 @@ pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, Problem> {
     serde_json::from_str(text).map_err(|e| Problem::json(&e))
 }
 
-/// Opens a volume and describes it, on a blocking thread.
-pub(super) async fn opened(
+/// Opens a volume and describes it, on a blocking thread. Without a name: the master's own, or its first
+/// that can be read; `None` if there is none.
+async fn opened(
     shared: &Arc<Shared>,
-    choice: VolumeChoice,
+    name: Option<String>,
     viewer: Viewer,
     size: [u32; 2],
-) -> Result<Shown, Problem> {
+) -> Result<Option<Shown>, Problem> {
     let home = shared.config.home.clone();
     let described = shared.handle.reading(move |library| {
+        let choice = match name {
+            Some(name) => VolumeChoice::Name(name),
+            None if library.default_volume().is_some() => VolumeChoice::Default,
+            None => {
+                let listed = library.list(viewer).into_iter();
+                match listed.map(|entry| (entry.problem, entry.name)).min() {
+                    Some((_, first)) => VolumeChoice::Name(first),
+                    None => return Ok(None),
+                }
+            }
+        };
         let open = library.open(&choice, viewer)?;
         let name = library.name_of(open.served.info.digest, viewer);
-        describe(&open, name, size, &home)
+        describe(&open, name, size, &home).map(Some)
     });
     described.await.ok_or_else(Problem::ending)?
 }

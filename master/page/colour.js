@@ -200,14 +200,14 @@ export function colourPanel(core, overlay) {
       const act = (/** @type {number} */ k) => () => put(emphasised(core.state.tf, r.from, r.to, k, range()), "");
       const chip = h("i", { class: "chip" });
       chip.style.background = r.color;
-      return h("li", {}, chip, h("span", { text: name }), h("b", { text: `${Math.round(r.share * 100)} %` }),
+      return h("li", {}, chip, h("span", { text: name }), h("b", { text: `${r.share < 0.005 ? "<1" : Math.round(r.share * 100)} %` }),
         h("button", { type: "button", "aria-label": `More of ${name}`, text: "More", onclick: act(1.6) }),
         h("button", { type: "button", "aria-label": `Less of ${name}`, text: "Less", onclick: act(0.4) }));
     });
     const unit = core.volume.unit;
     picked.replaceChildren(
       h("header", {}, h("h2", { text: `Pixel ${m.x}, ${m.y}` }), close),
-      m.hit ? h("p", { text: `Surface at ${m.hit.map((/** @type {number} */ x) => numberWords(x, 4)).join(", ")} ${unit}, value ${numberWords(m.value, 4)}` })
+      m.hit ? h("p", { text: `Surface at ${m.hit.map((/** @type {number} */ x) => numberWords(x, 4)).join(", ")}${unit && ` ${unit}`}, value ${numberWords(m.value, 4)}` })
         : h("p", { text: "Nothing stops the light here." }),
       rows.length ? h("ul", {}, ...rows) : null,
       m.hit ? h("button", { type: "button", text: "Look at this point",

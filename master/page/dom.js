@@ -90,7 +90,8 @@ export const numberWords = (x, digits = 6) => String(Number(x.toPrecision(digits
  * number, or beyond the limits, is put back.
  * @param {{label: string, unit?: string, min?: number, max?: number, step?: number, hidden?: boolean,
  *   onchange: (x: number) => void}} options
- * @returns {{el: HTMLElement, set: (x: number|null) => void, input: HTMLInputElement}}
+ * @returns {{el: HTMLElement, set: (x: number|null) => void, unit: (word: string) => void,
+ *   input: HTMLInputElement}}
  */
 export function numberField({ label, unit = "", min, max, step = 1, hidden = false, onchange }) {
   const input = h("input", {
@@ -113,10 +114,13 @@ export function numberField({ label, unit = "", min, max, step = 1, hidden = fal
     input.value = String(Number((Number(input.value || 0) + by).toPrecision(9)));
     take();
   });
+  const unitWord = unit ? h("i", { text: unit }) : null;
   const el = hidden ? input : h("label", { class: "num" }, h("span", { text: label }),
-    h("span", { class: "box" }, input, unit ? h("i", { text: unit }) : null));
+    h("span", { class: "box" }, input, unitWord));
   return {
     el, input,
+    /** @param {string} word  another unit; empty where nobody knows it */
+    unit(word) { if (unitWord) setText(unitWord, word); },
     set(x) {
       const text = x === null ? "" : numberWords(x);
       shown = text;

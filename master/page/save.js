@@ -187,7 +187,8 @@ export function savePanel(core) {
   core.on("volume", () => {
     keysShown = "";
     const names = [...filmFormat.select.options].map((o) => o.value);
-    if (!names.includes(core.state.film.format)) film({ format: names[0] });
+    const { state } = core;
+    if (!names.includes(state.film.format)) core.steps?.amend({ ...state, film: { ...state.film, format: names[0] } });
   });
   core.on("state", draw);
   return { el, shown: draw };

@@ -15,13 +15,21 @@ const SOURCES = {
 };
 
 /**
- * Largest error of all sources, in 1/255, or null.
+ * Sum of the errors of all sources in words, or nothing while one of them is not measured: a part says
+ * little of the whole.
  * @param {any} error
  */
-export function largestError(error) {
-  const values = Object.values(error ?? {}).filter((e) => e && Number.isFinite(/** @type {any} */ (e).value));
-  return values.length ? Math.max(...values.map((e) => /** @type {any} */ (e).value)) : null;
+export function errorWords(error) {
+  const all = Object.values(error ?? {});
+  if (!all.length || !all.every((e) => Number.isFinite(e?.value))) return "";
+  return offWords(all.reduce((sum, e) => sum + e.value, 0), all.every((e) => e.kind !== "estimate"));
 }
+
+/**
+ * @param {number} off  in 1/255
+ * @param {boolean} bound  it cannot be more
+ */
+const offWords = (off, bound) => `off ${bound ? "≤" : "≈"} ${off < 9.95 ? off.toFixed(1) : Math.round(off)}/255`;
 
 /** @param {number} ms */
 const msWords = (ms) => (ms < 9.95 ? ms.toFixed(1) : String(Math.round(ms)));
@@ -57,8 +65,8 @@ export function shownPanel(core, strip) {
     setText(parts.state, stale ? "old picture" : still ? "sharp" : "moving");
     setText(parts.ms, `${msWords(last.ms.total)} ms`);
     setText(parts.level, last.level ? `level ${last.level}` : "full level");
-    const off = still ? largestError(last.error) : last.bound * 255;
-    setText(parts.error, off === null || Number.isNaN(off) ? "" : `off ≤ ${off < 9.95 ? off.toFixed(1) : Math.round(off)}/255`);
+    const off = last.bound * 255;
+    setText(parts.error, still ? errorWords(last.error) : Number.isNaN(off) ? "" : offWords(off, true));
     const known = still && hash && hash.message === last.source;
     setText(parts.hash, known ? `${hash.hex.slice(0, 8)} ${hash.same ? "=" : "≠"} file` : "");
     setAttr(parts.hash, "data-same", known ? String(hash.same) : null);
@@ -69,7 +77,7 @@ export function shownPanel(core, strip) {
       ["Time", `${msWords(last.ms.total)} ms: ${msWords(last.ms.draw)} drawing, ${msWords(last.ms.encode)} encoding, ${msWords(last.ms.wait)} waiting`],
       ["Level", String(last.level)],
       ["Sheets", last.thickness ? `${Number(last.thickness.toFixed(3))} vox thick` : "–"],
-      ["Drawn by", `${last.workers} worker${last.workers === 1 ? "" : "s"}, ${last.threads} threads`],
+      ["Drawn by", `${last.workers} worker${last.workers === 1 ? "" : "s"}${last.threads ? `, ${last.threads} threads` : ""}`],
       ["Sent", bytesWords(last.bytes)],
       ["Pixels here", known ? hash.hex : "–"],
       ["Pixels of the file", last.sha256 ?? "–"],

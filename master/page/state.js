@@ -227,6 +227,12 @@ export class Steps {
     this.at = at;
   }
 
+  /**
+   * Puts a state in place of the present one: no step of anybody's hand.
+   * @param {State} state
+   */
+  amend(state) { this.past[this.past.length - 1] = state; }
+
   /** @returns {State|null} */
   undo() {
     if (this.past.length < 2) return null;

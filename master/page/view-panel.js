@@ -83,6 +83,7 @@ export function viewPanel(core) {
     standing);
   core.on("volume", (volume) => {
     standing.hidden = volume.anatomical;
+    height.unit(volume.unit);
     for (const b of sides.children) setText(b, sideWords(core, b.dataset.side).replace(/^./, (c) => c.toUpperCase()));
   });
   const draw = () => {

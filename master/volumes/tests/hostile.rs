@@ -245,8 +245,8 @@ fn small_files_with_large_sizes_take_neither_memory_nor_time() {
     let before = peak_mib();
     for (sizes, kind, encoding, data, say) in [
         ("16384 16384 32", "double", "raw", &b"tiny"[..], "68719476736 bytes are needed and 4"),
-        ("16384 16384 16384", "double", "raw", b"tiny", "more than 8589934592 samples"),
-        ("4000 4000 4000", "uint8", "raw", b"tiny", "more than 8589934592 samples"),
+        ("16384 16384 16384", "double", "raw", b"tiny", "more than 68719476736 samples"),
+        ("5000 5000 5000", "uint8", "raw", b"tiny", "more than 68719476736 samples"),
         ("4294967296 4294967296 1", "uint8", "raw", b"tiny", "is longer than 16384"),
         ("99999999999999999999 1 1", "uint8", "raw", b"tiny", "something else than whole"),
         ("2000 2000 2000", "uint8", "gzip", b"tiny", "can't hold so many"),

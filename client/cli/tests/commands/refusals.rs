@@ -196,7 +196,7 @@ fn world() -> tempfile::TempDir {
     put("none/good.nrrd", b"");
     put(
         "scans/1.dcm",
-        &[&[0; 128][..], b"DICM\x02\0\x10\0UI\x16\x001.2.840.10008.1.2.4.90"].concat(),
+        &[&[0; 128][..], b"DICM\x02\0\x10\0UI\x18\x001.2.840.10008.1.2.4.201\0"].concat(),
     );
     put("array/.zarray", br#"{"zarr_format":2,"shape":[9,9,9],"chunks":[9,9,9],"dtype":"<c8"}"#);
     put("group/.zgroup", b"{}");

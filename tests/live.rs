@@ -119,15 +119,16 @@ impl Page {
             all[field] = value.clone();
         }
         socket.send(Message::text(all.to_string())).await.expect("it reads");
-        Session { socket, tiles: Vec::new(), passes: Vec::new() }
+        Session { socket, tiles: Vec::new(), came: Vec::new(), passes: Vec::new() }
     }
 }
 
 /// A client's end of a socket.
 struct Session {
     socket: WebSocketStream<TcpStream>,
-    /// Tiles of the pass that comes.
+    /// Tiles of the pass that comes, and when each came.
     tiles: Vec<Vec<u8>>,
+    came: Vec<Instant>,
     /// Views whose passes came, and which pass.
     passes: Vec<(u64, String)>,
 }
@@ -140,14 +141,32 @@ impl Session {
     /// Waits for the next message of text; tiles on the way are kept.
     async fn next(&mut self) -> Value {
         loop {
-            let message = tokio::time::timeout(PATIENCE, self.socket.next()).await;
-            match message.expect("in time").expect("no end").expect("no error") {
-                Message::Text(text) => return serde_json::from_str(&text).expect("JSON"),
-                Message::Binary(bytes) => self.tiles.push(bytes.to_vec()),
-                Message::Close(frame) => panic!("closed: {frame:?}"),
-                _ => {}
+            if let Some(text) = self.wait_for_a_message().await {
+                return text;
             }
         }
+    }
+
+    /// Waits for a message of any kind, and returns it if it is text; a tile is kept.
+    async fn wait_for_a_message(&mut self) -> Option<Value> {
+        let message = tokio::time::timeout(PATIENCE, self.socket.next()).await;
+        match message.expect("in time").expect("no end").expect("no error") {
+            Message::Text(text) => return Some(serde_json::from_str(&text).expect("JSON")),
+            Message::Binary(bytes) => {
+                self.tiles.push(bytes.to_vec());
+                self.came.push(Instant::now());
+            }
+            Message::Close(frame) => panic!("closed: {frame:?}"),
+            _ => {}
+        }
+        None
+    }
+
+    /// Counts the batches in which the tiles of the last pass came: those with at least `pause` between
+    /// them.
+    fn batches(&self, pause: Duration) -> usize {
+        let came = &self.came[self.came.len() - self.tiles.len()..];
+        came.windows(2).filter(|pair| pair[1] - pair[0] >= pause).count() + 1
     }
 
     /// Waits for a message of a type.
@@ -330,6 +349,52 @@ async fn stills_have_the_pixels_of_the_file_in_every_view_and_colour() {
     }
 }
 
+/// A still that takes long comes in batches while it is drawn, and none of them after a newer view's.
+#[tokio::test(flavor = "multi_thread")]
+async fn slow_still_comes_tile_by_tile_until_another_view_does() {
+    let slow = [1400u64, 1000];
+    let words = ["view", VOLUME, "--threads", "1", "--listen", "127.0.0.1:0"];
+    let page = start(&words);
+    let dir = tempfile::tempdir().expect("a folder");
+    let fog = json!({"rev": 1, "tf": "fog", "background": "#204060"});
+    let slow_view = |seq: u64| {
+        json!({"type": "view", "seq": seq, "camera": camera(7.0 * seq as f64), "size": slow,
+            "moving": false})
+    };
+    let hello = json!({"codecs": ["png"], "size": slow, "view": slow_view(1), "scene": fog});
+    let mut session = page.session(hello).await;
+    let done = session.still(1).await;
+    assert!(done["ms"]["draw"].as_f64().is_some_and(|ms| ms > 250.0), "not slow: {done}");
+    let tiles = &session.tiles;
+    let batches = session.batches(Duration::from_millis(25));
+    assert!(batches > 2, "{batches} batches of {} tiles", tiles.len());
+    let bytes: usize = tiles.iter().map(Vec::len).sum();
+    assert_eq!(json!(bytes), done["bytes"]);
+    session.pixels(&done);
+    let path = json!({"version": 1, "size": slow,
+        "keyframes": {"frames": 1, "keys": [camera(7.0)]}});
+    let file = rendered(dir.path(), &path, &["--tf", "fog", "--background", "#204060"]);
+    assert_eq!(json!(rgba_hash(&file)), done["sha256"]);
+
+    // Another view comes when the first tiles of a still are there.
+    session.passes.clear();
+    session.send(slow_view(2)).await;
+    let is_second_still = |tile: &Vec<u8>| tile[4] == 2 && tile[2] & 1 == 1;
+    while !session.tiles.last().is_some_and(is_second_still) {
+        session.wait_for_a_message().await;
+    }
+    session
+        .send(json!({"type": "view", "seq": 3, "camera": camera(50.0), "size": SIZE,
+        "moving": false}))
+        .await;
+    let done = session.still(3).await;
+    let seqs: Vec<u8> = session.tiles.iter().map(|tile| tile[4]).collect();
+    assert!(seqs.is_sorted(), "tiles of an older view after those of a newer: {seqs:?}");
+    assert!(!session.passes.contains(&(2, "still".into())), "it was dropped: {:?}", session.passes);
+    session.tiles.retain(|tile| tile[4] == 3);
+    session.pixels(&done);
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn latest_view_wins_and_its_still_always_comes() {
     let page = view(&[]);
@@ -453,7 +518,7 @@ async fn strangers_and_rule_breakers_are_turned_away() {
     assert_eq!(other.closed().await, 4400);
     let mut socket = page.dial().await.expect("a session");
     socket.send(Message::text("{\"type\": \"view\"}")).await.expect("it reads");
-    let silent = Session { socket, tiles: Vec::new(), passes: Vec::new() };
+    let silent = Session { socket, tiles: Vec::new(), came: Vec::new(), passes: Vec::new() };
     assert_eq!(silent.closed().await, 1008);
     let mut flood = page.session(json!({})).await;
     for t in 0..3000 {

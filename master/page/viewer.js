@@ -96,7 +96,8 @@ export class Viewer {
   /** @param {Tile} tile */
   tile(tile) {
     if (this.pass && pairOrder(tile, this.pass) < 0) return;
-    if (!this.pass?.is(tile)) this.begin(new Pass(tile));
+    // A pass begins anew where tiles of it were not what was drawn in the end.
+    if (!this.pass?.is(tile) || tile.first && this.pass.came) this.begin(new Pass(tile));
     const pass = /** @type {Pass} */ (this.pass);
     pass.came++;
     pass.bound = tile.bound;

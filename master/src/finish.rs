@@ -4,7 +4,7 @@
 //! while the next one is rendered. Tiles that come finished are composed into its picture while
 //! its other tiles are drawn.
 
-use crate::jobs::FinishedFrame;
+use crate::jobs::{DrawnTile, FinishedFrame};
 use sha2::{Digest, Sha256};
 use slabcast_common::bounds;
 use slabcast_common::brick::TightBox;
@@ -23,6 +23,7 @@ use slabcast_scene::request::PathRequest;
 use slabcast_schedule::{Span, Spans};
 use slabcast_volumes::BrickStore;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use tokio::sync::mpsc;
 
 /// A picture that finished tiles are composed into as they come.
 pub(crate) struct Assembly {
@@ -33,11 +34,19 @@ pub(crate) struct Assembly {
     /// `None` before the first tile: allocating it takes the longer the larger it is, so the
     /// driver leaves that to a finisher.
     picture: Mutex<Option<FrameAssembler>>,
+    /// Who is told of tiles before the picture is done.
+    tiles: Option<mpsc::Sender<DrawnTile>>,
 }
 
 impl Assembly {
-    pub(crate) fn new(size: [u32; 2], finish: PixelEncoding) -> Assembly {
-        Assembly { size, finish, pending: Mutex::default(), picture: Mutex::default() }
+    /// An empty picture of `size` (width, height) in the encoding `finish`. `tiles`: who is told of
+    /// tiles as they are composed; those for which the channel has no room are not told.
+    pub(crate) fn new(
+        size: [u32; 2],
+        finish: PixelEncoding,
+        tiles: Option<mpsc::Sender<DrawnTile>>,
+    ) -> Assembly {
+        Assembly { size, finish, pending: Mutex::default(), picture: Mutex::default(), tiles }
     }
 
     /// Adds tiles that are to be composed.
@@ -45,12 +54,26 @@ impl Assembly {
         self.pending.lock().unwrap_or_else(PoisonError::into_inner).extend(tiles);
     }
 
-    /// Composes the tiles that came so far.
+    /// Composes the tiles that came so far, and tells of them.
     ///
     /// # Panics
     /// If an earlier call panicked: its tiles are lost.
     pub(crate) fn compose(&self) {
-        self.compose_into(&mut self.picture());
+        let placed = self.compose_into(&mut self.picture());
+        self.tell(placed);
+    }
+
+    /// Passes tiles on, each as a picture of its own with the background where nothing is.
+    fn tell(&self, placed: Vec<(Rect, SparseTile)>) {
+        let Some(listener) = &self.tiles else { return };
+        for (place, leaves) in placed {
+            // Nobody waits for a reader: the whole picture comes later.
+            let Ok(room) = listener.try_reserve() else { return };
+            let size = leaves.size;
+            let mut alone = FrameAssembler::new(size, &self.finish);
+            alone.place(&[(Rect::from_size(size), leaves)]);
+            room.send(DrawnTile { place, bytes: alone.into_bytes() });
+        }
     }
 
     /// Returns the picture with all tiles that came.
@@ -67,13 +90,15 @@ impl Assembly {
         self.picture.lock().expect("no finisher panicked while it composed this picture")
     }
 
-    fn compose_into(&self, picture: &mut Option<FrameAssembler>) {
+    /// Composes the tiles that came so far, and returns them.
+    fn compose_into(&self, picture: &mut Option<FrameAssembler>) -> Vec<(Rect, SparseTile)> {
         // Taken while the picture is locked, so that whoever ends the picture finds no tile that
         // another thread has taken and not composed.
         let mut pending = self.pending.lock().unwrap_or_else(PoisonError::into_inner);
         let tiles = std::mem::take(&mut *pending);
         drop(pending);
         picture.get_or_insert_with(|| FrameAssembler::new(self.size, &self.finish)).place(&tiles);
+        tiles
     }
 }
 

@@ -6,7 +6,7 @@ use crate::finishers::Finishers;
 use crate::hooks::{Hooks, Stage};
 use crate::jobs::active::Submitter;
 use crate::jobs::submit::{Plan, SubmitError, check_key};
-use crate::jobs::{FinishedFrame, JobState, JobView, Jobs, Watch, WatchItem};
+use crate::jobs::{DrawnTile, FinishedFrame, JobState, JobView, Jobs, Watch, WatchItem};
 use crate::library::{Library, Viewer, VolumeError};
 use crate::link::{Caller, WorkerLink};
 use crate::memory::Shares;
@@ -256,12 +256,14 @@ impl Handle {
         peer: Option<IpAddr>,
     ) -> Result<JobId, SubmitError> {
         let submitter = Submitter::Batch(peer.map(counted_as));
-        self.submit_for(request, submitter, self.viewer(peer)).await.map(|admitted| admitted.job)
+        let admitted = self.submit_for(request, submitter, self.viewer(peer), None).await?;
+        Ok(admitted.job)
     }
 
     /// Submits a path of one frame for a live session, which is a number that no other session has.
     /// `viewer` decides which volumes it may name. Jobs of sessions are listed nowhere; dropping
-    /// what is returned ends the job.
+    /// what is returned ends the job. `tiles` is told of tiles as they are drawn, while the picture is
+    /// not done: of some at a time, and of none for which it has no room.
     ///
     /// # Errors
     /// As [`Handle::submit`].
@@ -270,9 +272,10 @@ impl Handle {
         request: PathRequest,
         session: u64,
         viewer: Viewer,
+        tiles: Option<mpsc::Sender<DrawnTile>>,
     ) -> Result<Drawing, SubmitError> {
         let Admitted { job, guard } =
-            self.submit_for(request, Submitter::Live(session), viewer).await?;
+            self.submit_for(request, Submitter::Live(session), viewer, tiles).await?;
         let watch = Watch::new(self.jobs.clone(), job, 0, self.inbox.clone());
         Ok(Drawing { watch, _guard: guard })
     }
@@ -282,6 +285,7 @@ impl Handle {
         request: PathRequest,
         submitter: Submitter,
         viewer: Viewer,
+        tiles: Option<mpsc::Sender<DrawnTile>>,
     ) -> Result<Admitted, SubmitError> {
         let peer = submitter.peer();
         check_key(&request.client_key)?;
@@ -308,7 +312,8 @@ impl Handle {
             })
         });
         let plan = planned.await.ok_or(SubmitError::Gone)?;
-        let plan = Box::new(plan.map_err(|e| SubmitError::Panicked(e.to_string()))??);
+        let mut plan = Box::new(plan.map_err(|e| SubmitError::Panicked(e.to_string()))??);
+        plan.tiles = tiles;
         let (reply, answer) = oneshot::channel();
         if self.inbox.send(Event::Submit { plan, submitter, reply }).await.is_err() {
             return Err(SubmitError::Gone);

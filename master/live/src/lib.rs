@@ -13,6 +13,7 @@
 //! have threads of their own.
 
 mod assets;
+mod blocks;
 mod files;
 mod guard;
 mod http;

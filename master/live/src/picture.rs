@@ -1,29 +1,39 @@
 //! One pass: from view and scene to a request, its frame, and its tiles.
 
+use crate::blocks::Blocks;
 use crate::messages::{Scene, View};
-use crate::preview::{RUNGS, Setting};
+use crate::preview::{RUNGS, SLOW_MS, Setting};
 use crate::problem::Problem;
 use crate::shared::{LIVE_EDGE, LIVE_PIXELS, Shared};
 use crate::slot::{Pair, Pass};
-use crate::tile::{Codecs, Encoded, encode};
+use crate::tile::{Codecs, Encoded, encode, encode_parts, encode_rest};
 use crate::volume::Shown;
 use serde_json::{Value, json};
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::level::LevelChoice;
 use slabcast_common::quality::{InvalidField, Keep, Quality, Work};
 use slabcast_common::stats::{FrameMs, FrameStats};
-use slabcast_master::jobs::FinishedFrame;
+use slabcast_master::jobs::{DrawnTile, FinishedFrame};
 use slabcast_master::library::Viewer;
 use slabcast_scene::document::{black, still_path};
 use slabcast_scene::path::ViewPath;
 use slabcast_scene::request::PathRequest;
 use slabcast_scene::values::as_read_from_file;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
+use tokio::sync::mpsc;
 
 /// Samples of a volume of which all bricks are cut while its transfer function is being edited, so
 /// that an edit which shows other values cuts none. 64 Mi take some 250 MiB.
 const KEPT_SAMPLES: usize = 64 << 20;
+
+/// Shortest time between two batches of a still's tiles: each is some frames of a screen, and of a
+/// hundred small tiles one large one is made.
+const BATCH: Duration = Duration::from_millis(50);
+
+/// Drawn tiles that wait for their encoding; beyond it they are sent once the picture is done. Those of
+/// 64x64 pixels take 3 MiB.
+const TILES_WAITING: usize = 256;
 
 /// Checks the size of a live picture.
 ///
@@ -54,6 +64,23 @@ pub(crate) struct Order {
     pub(crate) codecs: Codecs,
     /// The frame, if it was drawn before.
     pub(crate) frame: Option<Arc<FinishedFrame>>,
+    /// Number of the pass, and where its tiles go that are sent before it is drawn.
+    pub(crate) number: u64,
+    pub(crate) early: mpsc::Sender<Early>,
+}
+
+/// Tiles of a still that is being drawn.
+pub(crate) struct Early {
+    /// Number of the pass.
+    pub(crate) number: u64,
+    /// Tiles as they are sent.
+    pub(crate) tiles: Vec<bytes::Bytes>,
+}
+
+/// What of a still was sent while it was drawn.
+struct Sent {
+    blocks: Blocks,
+    bytes: usize,
 }
 
 /// Returns the request that draws a pair. `edited`: the scene is being changed.
@@ -121,12 +148,75 @@ pub(crate) async fn frame_of(
 ) -> Result<Arc<FinishedFrame>, Problem> {
     let request = PathRequest { client_key: shared.fresh_key(), ..request.clone() };
     let began = Instant::now();
-    let mut drawing = shared.handle.draw(request, session, viewer).await?;
+    let mut drawing = shared.handle.draw(request, session, viewer, None).await?;
     let submitted_ms = ms(began);
     let frame = drawing.finished().await.map_err(|reason| Problem::new("internal", reason))?;
     let scheduled = frame.stats.ms;
     tracing::debug!(session, submitted_ms, whole_ms = ms(began), ?scheduled, "live pass drawn");
     Ok(frame)
+}
+
+/// Draws the frame of a still. If that takes longer than [`SLOW_MS`], its tiles are encoded and sent on
+/// while others are drawn.
+///
+/// # Errors
+/// Those of [`frame_of`], or an encoder refuses the pixels.
+async fn still_of(
+    shared: &Shared,
+    order: &Order,
+    session: u64,
+    viewer: Viewer,
+) -> Result<(Arc<FinishedFrame>, Option<Sent>), Problem> {
+    let (pair, codecs) = (order.pair, order.codecs);
+    let request = PathRequest { client_key: shared.fresh_key(), ..order.request.clone() };
+    let size = request.path.size;
+    let mut next = tokio::time::Instant::now() + Duration::from_millis(SLOW_MS as u64);
+    let (drawn, mut tiles) = mpsc::channel::<DrawnTile>(TILES_WAITING);
+    let mut drawing = shared.handle.draw(request, session, viewer, Some(drawn)).await?;
+    let mut sent = Sent { blocks: Blocks::new(size), bytes: 0 };
+    let (mut came, mut more_come) = (Vec::new(), true);
+    loop {
+        tokio::select! {
+            biased;
+            frame = drawing.finished() => {
+                let frame = frame.map_err(|reason| Problem::new("internal", reason))?;
+                return Ok((frame, sent.blocks.has_sent().then_some(sent)));
+            }
+            count = tiles.recv_many(&mut came, TILES_WAITING), if more_come => {
+                more_come = count > 0;
+                for DrawnTile { place, bytes } in came.drain(..) {
+                    sent.blocks.add(place, &bytes);
+                }
+            }
+            () = tokio::time::sleep_until(next), if sent.blocks.has_ready() => {
+                // Whoever reads slowly gets the rest at the end.
+                if let Ok(place) = order.early.try_reserve() {
+                    let encode = move || {
+                        let is_first = !sent.blocks.has_sent();
+                        let parts = sent.blocks.take();
+                        let (parts, of) = ((&parts[..], is_first), (pair, Pass::Still));
+                        let tiles = encode_parts(sent.blocks.rgb(), size, parts, of, codecs, 0.0)?;
+                        sent.bytes += tiles.iter().map(bytes::Bytes::len).sum::<usize>();
+                        Ok((sent, tiles))
+                    };
+                    let tiles;
+                    (sent, tiles) = encoding(encode).await?;
+                    place.send(Early { number: order.number, tiles });
+                }
+                next = tokio::time::Instant::now() + BATCH;
+            }
+        }
+    }
+}
+
+/// Encodes on a thread for what takes long.
+async fn encoding<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, String> + Send + 'static,
+) -> Result<T, Problem> {
+    let encoded = tokio::task::spawn_blocking(work).await;
+    encoded
+        .map_err(|e| Problem::new("internal", e.to_string()))?
+        .map_err(|e| Problem::new("internal", e))
 }
 
 /// Draws and encodes a pass.
@@ -140,30 +230,36 @@ pub(crate) async fn draw(
     viewer: Viewer,
     asked_at: Instant,
 ) -> Result<Drawn, Problem> {
-    let Order { pair, pass, request, codecs, frame } = order;
+    let (pair, pass, codecs) = (order.pair, order.pass, order.codecs);
     let (began, wait) = (Instant::now(), ms(asked_at));
-    let was_there = frame.is_some();
-    let frame = match frame {
-        Some(frame) => frame,
-        None => frame_of(&shared, &request, session, viewer).await?,
+    let was_there = order.frame.is_some();
+    let (frame, sent) = match &order.frame {
+        Some(frame) => (frame.clone(), None),
+        None if pass == Pass::Still => still_of(&shared, &order, session, viewer).await?,
+        None => (frame_of(&shared, &order.request, session, viewer).await?, None),
     };
     // Bricks that had to be sent at first say nothing of the next frame.
     let FrameMs { distribute, overlap, .. } = frame.stats.ms;
     let draw_ms = ms(began);
     let steady_ms = (draw_ms - (distribute - overlap).max(0.0)).max(0.0);
-    let encoding = Instant::now();
+    let encoding_began = Instant::now();
     let bound = if pass == Pass::Still { 0.0 } else { f32::NAN };
     let pixels = frame.clone();
-    let encode = move || encode(&pixels.bytes, pixels.size, (pair, pass), codecs, bound);
-    let encoded = tokio::task::spawn_blocking(encode).await;
-    let encoded = encoded
-        .map_err(|e| Problem::new("internal", e.to_string()))?
-        .map_err(|e| Problem::new("internal", e))?;
-    let bytes: usize = encoded.tiles.iter().map(bytes::Bytes::len).sum();
+    let early_bytes = sent.as_ref().map_or(0, |sent| sent.bytes);
+    let encode = move || {
+        let (rgb, size) = (&pixels.bytes[..], pixels.size);
+        match sent.and_then(|sent| sent.blocks.rest(rgb)) {
+            Some(parts) => encode_rest(rgb, size, &parts, pair, codecs),
+            // Where sent tiles are not true the pass begins anew.
+            None => encode(rgb, size, (pair, pass), codecs, bound),
+        }
+    };
+    let encoded = encoding(encode).await?;
+    let bytes = early_bytes + encoded.tiles.iter().map(bytes::Bytes::len).sum::<usize>();
     let mut done = json!({
         "type": "done", "seq": pair.seq, "scene": pair.scene, "pass": pass.name(),
         "size": frame.size, "bytes": bytes,
-        "ms": {"wait": wait, "draw": draw_ms, "encode": ms(encoding), "total": ms(asked_at)},
+        "ms": {"wait": wait, "draw": draw_ms, "encode": ms(encoding_began), "total": ms(asked_at)},
     });
     if let Some(sha256) = &encoded.sha256 {
         done["sha256"] = sha256.as_str().into();

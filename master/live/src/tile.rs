@@ -17,13 +17,13 @@ const MOVING_QUALITY: u8 = 80;
 const THUMB_QUALITY: u8 = 85;
 
 /// Edge of a still's tiles, pixels: four of 512x512, each some 25 KiB.
-const STILL_EDGE: u32 = 256;
+pub(crate) const STILL_EDGE: u32 = 256;
 
 /// Pixels of a moving pass above which it is encoded in stripes, on several threads.
 const STRIPE_PIXELS: u32 = 512 * 256;
 
-/// Rows of a stripe are a multiple of this, as blocks of 4:2:0 are.
-const BLOCK: u32 = 16;
+/// Edges of tiles are multiples of this, as those of blocks of 4:2:0 are.
+pub(crate) const BLOCK: u32 = 16;
 
 const STILL: u16 = 1;
 const FIRST: u16 = 2;
@@ -44,12 +44,12 @@ pub(crate) struct Encoded {
 }
 
 /// A rectangle of pixels.
-#[derive(Clone, Copy)]
-struct Part {
-    x: u32,
-    y: u32,
-    w: u32,
-    h: u32,
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Part {
+    pub(crate) x: u32,
+    pub(crate) y: u32,
+    pub(crate) w: u32,
+    pub(crate) h: u32,
 }
 
 /// Copies a part of RGB pixels of a picture `width` wide.
@@ -129,23 +129,55 @@ pub(crate) fn encode(
         let rows = (0..h).step_by(rows as usize).map(|y| Part { x: 0, y, w, h: rows.min(h - y) });
         rows.collect()
     };
-    let flags = if is_still { STILL } else { 0 };
-    let tiles = || -> Result<Vec<Bytes>, String> {
-        let tiles = parts.par_iter().enumerate().map(|(i, part)| {
-            let pixels = cut(rgb, w, *part);
-            let flags = flags | if i == 0 { FIRST } else { 0 };
-            let mut bytes = header(0, flags, pair, *part, size, bound);
-            bytes[1] = if !is_still && codecs.jpeg {
-                jpeg(&pixels, *part, MOVING_QUALITY, &mut bytes)?
-            } else {
-                lossless(&pixels, *part, codecs.webp, &mut bytes)?
-            };
-            Ok(Bytes::from(bytes))
-        });
-        tiles.collect()
-    };
+    let tiles = || encode_parts(rgb, size, (&parts, true), (pair, pass), codecs, bound);
     let (tiles, sha256) = rayon::join(tiles, || is_still.then(|| rgba_sha256(rgb)));
     Ok(Encoded { tiles: tiles?, sha256 })
+}
+
+/// Encodes the parts of a still that are left. `parts`: which, and `rgb` the whole picture, of `size`
+/// pixels. Others were sent before, with the first tile of the pass.
+///
+/// # Errors
+/// An encoder refuses the pixels, in words.
+pub(crate) fn encode_rest(
+    rgb: &[u8],
+    size: [u32; 2],
+    parts: &[Part],
+    pair: Pair,
+    codecs: Codecs,
+) -> Result<Encoded, String> {
+    let tiles = || encode_parts(rgb, size, (parts, false), (pair, Pass::Still), codecs, 0.0);
+    let (tiles, sha256) = rayon::join(tiles, || rgba_sha256(rgb));
+    Ok(Encoded { tiles: tiles?, sha256: Some(sha256) })
+}
+
+/// Encodes parts of a picture of `size` pixels in RGB as tiles of a pass. `has_first`: the pass begins
+/// with them.
+///
+/// # Errors
+/// An encoder refuses the pixels, in words.
+pub(crate) fn encode_parts(
+    rgb: &[u8],
+    size: [u32; 2],
+    (parts, has_first): (&[Part], bool),
+    (pair, pass): (Pair, Pass),
+    codecs: Codecs,
+    bound: f32,
+) -> Result<Vec<Bytes>, String> {
+    let is_still = pass == Pass::Still;
+    let flags = if is_still { STILL } else { 0 };
+    let tiles = parts.par_iter().enumerate().map(|(i, part)| {
+        let pixels = cut(rgb, size[0], *part);
+        let flags = flags | if i == 0 && has_first { FIRST } else { 0 };
+        let mut bytes = header(0, flags, pair, *part, size, bound);
+        bytes[1] = if !is_still && codecs.jpeg {
+            jpeg(&pixels, *part, MOVING_QUALITY, &mut bytes)?
+        } else {
+            lossless(&pixels, *part, codecs.webp, &mut bytes)?
+        };
+        Ok(Bytes::from(bytes))
+    });
+    tiles.collect()
 }
 
 /// Encodes thumbnail number `index` of the request `id`.

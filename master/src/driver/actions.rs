@@ -160,7 +160,8 @@ impl Driver {
         let Some(flight) = self.flights.get_mut(&frame).filter(|_| !self.rehearse) else { return };
         let Some(job) = self.active.get(flight.job) else { return };
         let assembly = flight.assembly.get_or_insert_with(|| {
-            Arc::new(Assembly::new(flight.view.size, job.request.encoding()))
+            let (size, finish) = (flight.view.size, job.request.encoding());
+            Arc::new(Assembly::new(size, finish, job.tiles.clone()))
         });
         assembly.add(tiles);
         let task = FinishTask::Compose(frame, assembly.clone());

@@ -248,7 +248,7 @@ fn picture_whose_composing_panicked_is_not_finished() {
         format: PixelFormat::Rgb8,
         background: Background::Transparent,
     };
-    let assembly = Assembly::new([32, 32], finish);
+    let assembly = Assembly::new([32, 32], finish, None);
     // A tile that says to have a leaf and lacks its bytes.
     let mut leaves = SparseTile::blank([32, 32], PixelFormat::Rgb8);
     leaves.mask[0] = 1;
@@ -256,6 +256,33 @@ fn picture_whose_composing_panicked_is_not_finished() {
     let panicked = caught("composing tiles", || assembly.compose()).expect_err("it panics");
     assert_eq!(panicked.work, "composing tiles");
     caught("composing tiles", || assembly.compose()).expect_err("and ever after");
+}
+
+/// A listener that is slow misses tiles, and one that is gone harms nobody.
+#[test]
+fn listener_gets_the_tiles_for_which_it_has_room() {
+    let finish = slabcast_common::image::PixelEncoding {
+        format: PixelFormat::Rgb8,
+        background: Background::Colour([1.0, 0.0, 0.0]),
+    };
+    let (listener, mut told) = tokio::sync::mpsc::channel(1);
+    let assembly = Assembly::new([32, 16], finish, Some(listener));
+    let (left, right) = (Rect::new(0, 0, 16, 16), Rect::new(16, 0, 32, 16));
+    let blank = SparseTile::blank([16, 16], PixelFormat::Rgb8);
+    let mut full = blank.clone();
+    (full.mask[0], full.data) = (1, vec![7; 16 * 16 * 3]);
+    assembly.add(vec![(right, full), (left, blank.clone())]);
+    assembly.compose();
+    let tile = told.try_recv().expect("there was room for one");
+    assert_eq!((tile.place, tile.bytes), (right, vec![7; 16 * 16 * 3]));
+    assert!(told.try_recv().is_err());
+    assembly.add(vec![(left, blank.clone())]);
+    assembly.compose();
+    let tile = told.try_recv().expect("there is room again");
+    assert_eq!((tile.place, tile.bytes), (left, [255, 0, 0].repeat(16 * 16)));
+    drop(told);
+    assembly.add(vec![(left, blank)]);
+    assembly.compose();
 }
 
 /// A gate that holds a stage until it is opened, and tells when the stage has come to it.

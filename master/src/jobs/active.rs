@@ -1,7 +1,7 @@
 //! Jobs that still have frames to render, or whose frames may be asked for again.
 
-use super::Table;
 use super::submit::Views;
+use super::{DrawnTile, Table};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, JobId, SceneId};
 use slabcast_common::message::{LIVE_CLIENT, SceneSpec};
@@ -11,6 +11,7 @@ use slabcast_scene::tween::Tween;
 use std::collections::{BTreeMap, VecDeque};
 use std::net::IpAddr;
 use std::sync::Arc;
+use tokio::sync::mpsc;
 
 /// Finished jobs that can be watched again from the start without being submitted anew.
 const RENDERABLE_WHEN_DONE: usize = 4;
@@ -32,6 +33,8 @@ pub(crate) struct ActiveJob {
     pub(crate) next: u64,
     /// Number of frames that were begun, repeated ones included.
     pub(crate) begun: u64,
+    /// Who is told of a frame's tiles before the frame is done.
+    pub(crate) tiles: Option<mpsc::Sender<DrawnTile>>,
 }
 
 /// A frame that may be begun next.

@@ -26,6 +26,7 @@ use bytes::Bytes;
 use numbers::Numbers;
 use slabcast_common::ids::JobId;
 use slabcast_common::image::PixelFormat;
+use slabcast_common::occlusion::Rect;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::volume::Digest32;
 use slabcast_scene::path::Framing;
@@ -143,6 +144,16 @@ pub struct FinishedFrame {
     pub stats_json: String,
     /// Spans as a JSON array of Chrome trace events, if the client asked for them.
     pub trace_json: Option<String>,
+}
+
+/// A tile of a frame whose other tiles are still drawn. It has the bytes of the finished frame, unless
+/// the frame is drawn again because its worker was found to draw false pixels.
+#[derive(Clone, Debug)]
+pub struct DrawnTile {
+    /// Rectangle of the tile in the frame, in pixels.
+    pub place: Rect,
+    /// Pixels in the job's format, row by row from the top left of the tile.
+    pub bytes: Vec<u8>,
 }
 
 impl FinishedFrame {

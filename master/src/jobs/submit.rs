@@ -6,7 +6,7 @@
 //! ([`crate::Handle::submit`]) and the driver gets the finished plan.
 
 use super::active::ActiveJob;
-use super::{Job, JobState, JobView, window};
+use super::{DrawnTile, Job, JobState, JobView, window};
 use crate::handle::unix_ms;
 use crate::library::{OpenVolume, VolumeError};
 use crate::memory::Shares;
@@ -28,6 +28,7 @@ use slabcast_scene::tween::Tween;
 use slabcast_volumes::auto_level::AutoLevel;
 use slabcast_volumes::framing::{FramingError, framing_of};
 use std::sync::Arc;
+use tokio::sync::mpsc;
 
 /// Bytes of the longest `client_key`.
 const MAX_KEY_BYTES: usize = 200;
@@ -85,6 +86,8 @@ pub(crate) struct Plan {
     volume: VolumeInfo,
     /// Digest of the volume that was asked for.
     asked: Digest32,
+    /// Who is told of a frame's tiles before the frame is done; `None` from [`Plan::new`].
+    pub(crate) tiles: Option<mpsc::Sender<DrawnTile>>,
 }
 
 /// The views of a path, each made when it is asked for.
@@ -217,7 +220,8 @@ impl Plan {
             (0..views.len()).try_for_each(|number| views.view(number, info).map(|view| each(&view)))
         })?;
         let (volume, asked) = (info.clone(), asked.digest);
-        Ok(Plan { request, wanted, transfer, quality, tween, views, framing, volume, asked })
+        let tiles = None;
+        Ok(Plan { request, wanted, transfer, quality, tween, views, framing, volume, asked, tiles })
     }
 
     /// The job as the table shows it.
@@ -262,10 +266,11 @@ impl Plan {
 
     /// The job as the driver renders it, from bricks with the needs `bricks`.
     pub(crate) fn activate(self, id: JobId, bricks: BrickNeeds) -> ActiveJob {
-        let Plan { request, wanted, transfer, quality, tween, views, volume, .. } = self;
+        let Plan { request, wanted, transfer, quality, tween, views, volume, tiles, .. } = self;
         let (crop, key) = (wanted.crop, bricks.set_key(volume.digest));
         let scene = SceneSpec { id: SceneId(id.0), volume, transfer, quality, crop, bricks: key };
-        ActiveJob { request, scene: Arc::new(scene), tween, bricks, views, next: 0, begun: 0 }
+        let scene = Arc::new(scene);
+        ActiveJob { request, scene, tween, bricks, views, next: 0, begun: 0, tiles }
     }
 
     /// Digest of the level that is drawn.

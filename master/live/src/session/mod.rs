@@ -5,10 +5,11 @@
 //! (opening a volume, drawing, encoding) runs in tasks of its own and comes back as an [`Outcome`].
 
 mod asks;
+mod passes;
 mod thumbs;
 
 use crate::messages::{Ack, Head, Hello, LONGEST, Open, Ping, Scene, View, WatchAsk};
-use crate::picture::{self, Drawn, Order, check_size, request_of};
+use crate::picture::{Drawn, Early, check_size};
 use crate::preview::Preview;
 use crate::problem::Problem;
 use crate::server::stopped;
@@ -29,7 +30,7 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
-use tokio::task::{AbortHandle, JoinSet};
+use tokio::task::JoinSet;
 use tracing::debug;
 
 /// Time for the first message.
@@ -116,16 +117,6 @@ struct Queued {
     pass: Option<(Pair, Pass)>,
 }
 
-/// A pass that is being drawn.
-struct Drawing {
-    number: u64,
-    pair: Pair,
-    pass: Pass,
-    rung: usize,
-    request: PathRequest,
-    task: AbortHandle,
-}
-
 struct Session {
     shared: Arc<Shared>,
     id: u64,
@@ -143,8 +134,10 @@ struct Session {
     slot: Slot,
     preview: Preview,
     asked_at: Instant,
-    drawing: Option<Drawing>,
+    drawing: Option<passes::Drawing>,
     passes: u64,
+    /// Tiles of the still that is being drawn.
+    early: (mpsc::Sender<Early>, mpsc::Receiver<Early>),
     /// The last still, and its request: the same again need not be drawn.
     frame: Option<(PathRequest, Arc<FinishedFrame>)>,
     /// When passes were sent, for the pace.
@@ -291,6 +284,7 @@ async fn begin(
         asked_at: Instant::now(),
         drawing: None,
         passes: 0,
+        early: mpsc::channel(passes::EARLY_BATCHES),
         frame: None,
         sent: VecDeque::new(),
         painted_at: None,
@@ -313,6 +307,7 @@ async fn begin(
 enum Woken {
     Received(Option<Result<Message, axum::Error>>),
     Done(Option<Result<Outcome, tokio::task::JoinError>>),
+    Early(Option<Early>),
     MayWrite,
     Time,
     News,
@@ -348,8 +343,10 @@ impl Session {
                 }
             };
             let has_queue = !self.queue.is_empty();
+            let takes_early = self.queue.len() < passes::EARLY_WAITING;
             let woken = tokio::select! {
                 received = stream.next() => Woken::Received(received),
+                early = self.early.1.recv(), if takes_early => Woken::Early(early),
                 done = self.tasks.join_next(), if !self.tasks.is_empty() => Woken::Done(done),
                 place = writer.reserve(), if has_queue => match place {
                     Ok(place) => {
@@ -381,6 +378,7 @@ impl Session {
                     Err(end) => return end,
                 },
                 Woken::Done(Some(Ok(outcome))) => self.finish(outcome),
+                Woken::Early(early) => self.show_early(early),
                 // An aborted pass.
                 Woken::Done(_) | Woken::MayWrite | Woken::Time => {}
                 Woken::News => self.ask_news(),
@@ -689,61 +687,6 @@ impl Session {
                 }
             }
         }
-    }
-
-    fn drop_pass(&mut self) {
-        if let Some(drawing) = self.drawing.take() {
-            drawing.task.abort();
-            self.slot.dropped(self.shared.now());
-        }
-    }
-
-    fn begin_pass(&mut self, shown: &Arc<Shown>, pair: Pair, pass: Pass) {
-        self.drop_thumb();
-        let rung = if pass == Pass::Moving { self.preview.choose().0 } else { 0 };
-        let edited = self.edited && pass == Pass::Moving;
-        let request = request_of(shown, &self.view, &self.scene, (pass, rung), edited);
-        let known = self.frame.as_ref().filter(|(of, _)| *of == request);
-        let frame = known.map(|(_, frame)| frame.clone());
-        self.passes += 1;
-        let number = self.passes;
-        let order = Order { pair, pass, request: request.clone(), codecs: self.codecs, frame };
-        let (shared, id, viewer, asked_at) =
-            (self.shared.clone(), self.id, self.viewer, self.asked_at);
-        let task = self.tasks.spawn(async move {
-            let result = picture::draw(shared, order, id, viewer, asked_at).await;
-            Outcome::Drawn { number, result: result.map(Box::new) }
-        });
-        self.slot.begun(pair, pass);
-        self.drawing = Some(Drawing { number, pair, pass, rung, request, task });
-    }
-
-    fn drawn(&mut self, number: u64, result: Result<Box<Drawn>, Problem>) {
-        let Some(drawing) = self.drawing.take_if(|drawing| drawing.number == number) else {
-            return;
-        };
-        let Drawing { pair, pass, rung, request, .. } = drawing;
-        let Drawn { frame, encoded, mut done, steady_ms } = match result {
-            Ok(drawn) => *drawn,
-            Err(problem) => {
-                self.slot.failed();
-                self.refuse(&problem, "scene", pair.scene.into());
-                return;
-            }
-        };
-        done["threads"] = self.threads.into();
-        if let Some(ms) = steady_ms {
-            self.preview.drawn(rung, ms);
-        }
-        if pass == Pass::Still {
-            self.frame = Some((request, frame));
-        }
-        let tiles = encoded.tiles.into_iter().map(Message::Binary);
-        let whole = tiles.chain([text(&done)]);
-        let of = Some((pair, pass));
-        self.queue.extend(whole.map(|message| Queued { message, pass: of }));
-        self.slot.delivered();
-        self.sent.push_back((pair, pass, Instant::now()));
     }
 }
 

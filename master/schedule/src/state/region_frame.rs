@@ -21,8 +21,12 @@ use crate::state::workers::{LANES, Roster};
 use crate::{Action, FrameJob, Micros};
 use slabcast_common::blocks::Block;
 use slabcast_common::ids::WorkerId;
-use slabcast_common::message::{Pixels, RegionCost};
+use slabcast_common::message::{Pixels, RegionCost, is_live};
 use slabcast_common::occlusion::Rect;
+
+/// Least batches in which the tiles of a live session's frame are laid into its picture: a person sees
+/// them come. One thread has some 12 tiles of a frame, which [`TILES_LAID_TOGETHER`] would not reach.
+const LIVE_BATCHES: usize = 16;
 
 /// Limit: task ids reserved for pieces of each tile of a sole frame.
 const PIECES_PER_TILE: u64 = 9;
@@ -186,11 +190,17 @@ impl RegionFrame {
         cost: Option<RegionCost>,
     ) {
         let tile = self.core.table.tile(place);
+        let together = if is_live(self.core.job.client) {
+            let all = self.core.table.queue.tasks.len();
+            (all / LIVE_BATCHES).clamp(1, TILES_LAID_TOGETHER)
+        } else {
+            TILES_LAID_TOGETHER
+        };
         let picture = &mut self.core.picture;
         match pixels {
             Pixels::Finished(leaves) => {
                 picture.place_encoded(tile, leaves);
-                if picture.encoded_tiles().len() >= TILES_LAID_TOGETHER {
+                if picture.encoded_tiles().len() >= together {
                     let (frame, tiles) = (self.core.job.frame, picture.take_encoded());
                     cluster.out.push_back(Action::Finished { frame, tiles });
                 }

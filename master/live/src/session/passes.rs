@@ -1,0 +1,102 @@
+//! A session's passes: how they begin, how their tiles are queued, and how they end.
+
+use super::{Outcome, Queued, Session, text};
+use crate::picture::{self, Drawn, Early, Order, request_of};
+use crate::problem::Problem;
+use crate::slot::{Pair, Pass};
+use crate::volume::Shown;
+use axum::extract::ws::Message;
+use slabcast_scene::request::PathRequest;
+use std::sync::Arc;
+use std::time::Instant;
+use tokio::task::AbortHandle;
+
+/// Batches of a still's tiles that wait for the session. With none, a pass that was encoded waits with
+/// its next batch.
+pub(super) const EARLY_BATCHES: usize = 2;
+
+/// Messages that wait to be written beyond which no tiles are taken of a still that is being drawn: some
+/// of its batches. Whoever reads slowly gets larger tiles, at the end.
+pub(super) const EARLY_WAITING: usize = 64;
+
+/// A pass that is being drawn.
+pub(super) struct Drawing {
+    number: u64,
+    pair: Pair,
+    pass: Pass,
+    rung: usize,
+    request: PathRequest,
+    task: AbortHandle,
+}
+
+impl Session {
+    /// Queues tiles of the still that is being drawn. Those of a dropped one are left out.
+    pub(super) fn show_early(&mut self, early: Option<Early>) {
+        let Some(Early { number, tiles }) = early else { return };
+        let drawing = self.drawing.as_ref().filter(|drawing| drawing.number == number);
+        let Some(of) = drawing.map(|drawing| (drawing.pair, drawing.pass)) else { return };
+        let tiles = tiles.into_iter().map(Message::Binary);
+        self.queue.extend(tiles.map(|message| Queued { message, pass: Some(of) }));
+    }
+
+    pub(super) fn drop_pass(&mut self) {
+        if let Some(drawing) = self.drawing.take() {
+            drawing.task.abort();
+            self.slot.dropped(self.shared.now());
+        }
+    }
+
+    pub(super) fn begin_pass(&mut self, shown: &Arc<Shown>, pair: Pair, pass: Pass) {
+        self.drop_thumb();
+        let rung = if pass == Pass::Moving { self.preview.choose().0 } else { 0 };
+        let edited = self.edited && pass == Pass::Moving;
+        let request = request_of(shown, &self.view, &self.scene, (pass, rung), edited);
+        let known = self.frame.as_ref().filter(|(of, _)| *of == request);
+        let frame = known.map(|(_, frame)| frame.clone());
+        self.passes += 1;
+        let number = self.passes;
+        let (codecs, early) = (self.codecs, self.early.0.clone());
+        let request_of_pass = request.clone();
+        let order = Order { pair, pass, request: request_of_pass, codecs, frame, number, early };
+        let (shared, id, viewer, asked_at) =
+            (self.shared.clone(), self.id, self.viewer, self.asked_at);
+        let task = self.tasks.spawn(async move {
+            let result = picture::draw(shared, order, id, viewer, asked_at).await;
+            Outcome::Drawn { number, result: result.map(Box::new) }
+        });
+        self.slot.begun(pair, pass);
+        self.drawing = Some(Drawing { number, pair, pass, rung, request, task });
+    }
+
+    pub(super) fn drawn(&mut self, number: u64, result: Result<Box<Drawn>, Problem>) {
+        // They were made before.
+        while let Ok(early) = self.early.1.try_recv() {
+            self.show_early(Some(early));
+        }
+        let Some(drawing) = self.drawing.take_if(|drawing| drawing.number == number) else {
+            return;
+        };
+        let Drawing { pair, pass, rung, request, .. } = drawing;
+        let Drawn { frame, encoded, mut done, steady_ms } = match result {
+            Ok(drawn) => *drawn,
+            Err(problem) => {
+                self.slot.failed();
+                self.refuse(&problem, "scene", pair.scene.into());
+                return;
+            }
+        };
+        done["threads"] = self.threads.into();
+        if let Some(ms) = steady_ms {
+            self.preview.drawn(rung, ms);
+        }
+        if pass == Pass::Still {
+            self.frame = Some((request, frame));
+        }
+        let tiles = encoded.tiles.into_iter().map(Message::Binary);
+        let whole = tiles.chain([text(&done)]);
+        let of = Some((pair, pass));
+        self.queue.extend(whole.map(|message| Queued { message, pass: of }));
+        self.slot.delivered();
+        self.sent.push_back((pair, pass, Instant::now()));
+    }
+}

@@ -24,8 +24,8 @@ use slabcast_common::ids::WorkerId;
 use slabcast_common::message::{Pixels, RegionCost, is_live};
 use slabcast_common::occlusion::Rect;
 
-/// Least batches in which the tiles of a live session's frame are laid into its picture: a person sees
-/// them come. One thread has some 12 tiles of a frame, which [`TILES_LAID_TOGETHER`] would not reach.
+/// Limit: batches in which the tiles of a live session's frame are laid into its picture, at least. A
+/// person sees them come. One thread has some 12 tiles of a frame, which [`TILES_LAID_TOGETHER`] would not reach.
 const LIVE_BATCHES: usize = 16;
 
 /// Limit: task ids reserved for pieces of each tile of a sole frame.

@@ -79,7 +79,7 @@ pub(crate) enum Event {
 /// A job that was taken.
 pub(crate) struct Admitted {
     pub(crate) job: JobId,
-    /// Of a live session's job: ends it when whoever asked is gone, at whatever moment.
+    /// Guard of a live session's job; dropping it ends the job. `None` for jobs of clients.
     pub(crate) guard: Option<Forgets>,
 }
 

@@ -34,13 +34,13 @@ pub(crate) struct Assembly {
     /// `None` before the first tile: allocating it takes the longer the larger it is, so the
     /// driver leaves that to a finisher.
     picture: Mutex<Option<FrameAssembler>>,
-    /// Who is told of tiles before the picture is done.
+    /// Receiver of tiles before the picture is done; `None` for jobs of clients.
     tiles: Option<mpsc::Sender<DrawnTile>>,
 }
 
 impl Assembly {
-    /// An empty picture of `size` (width, height) in the encoding `finish`. `tiles`: who is told of
-    /// tiles as they are composed; those for which the channel has no room are not told.
+    /// Returns an empty picture of `size` (width, height) pixels in the encoding `finish`. `tiles` receives
+    /// tiles as they are composed; tiles for which the channel has no room are left out.
     pub(crate) fn new(
         size: [u32; 2],
         finish: PixelEncoding,
@@ -54,7 +54,7 @@ impl Assembly {
         self.pending.lock().unwrap_or_else(PoisonError::into_inner).extend(tiles);
     }
 
-    /// Composes the tiles that came so far, and tells of them.
+    /// Composes the tiles that came so far, and sends them to the receiver of tiles.
     ///
     /// # Panics
     /// If an earlier call panicked: its tiles are lost.
@@ -63,11 +63,11 @@ impl Assembly {
         self.tell(placed);
     }
 
-    /// Passes tiles on, each as a picture of its own with the background where nothing is.
+    /// Sends tiles to the receiver, each as pixels over the background.
     fn tell(&self, placed: Vec<(Rect, SparseTile)>) {
         let Some(listener) = &self.tiles else { return };
         for (place, leaves) in placed {
-            // Nobody waits for a reader: the whole picture comes later.
+            // A full channel holds nothing up: the whole picture comes later.
             let Ok(room) = listener.try_reserve() else { return };
             let size = leaves.size;
             let mut alone = FrameAssembler::new(size, &self.finish);

@@ -260,13 +260,13 @@ impl Handle {
         Ok(admitted.job)
     }
 
-    /// Submits a path of one frame for a live session, which is a number that no other session has.
-    /// `viewer` decides which volumes it may name. Jobs of sessions are listed nowhere; dropping
-    /// what is returned ends the job. `tiles` is told of tiles as they are drawn, while the picture is
-    /// not done: of some at a time, and of none for which it has no room.
+    /// Submits a path of one frame for the live session with the unique number `session`. `viewer` decides
+    /// which volumes the path may name. Lists of jobs leave such jobs out. Dropping the returned value
+    /// ends the job. `tiles` receives tiles in batches while the frame is drawn; tiles for which the
+    /// channel has no room are left out.
     ///
     /// # Errors
-    /// As [`Handle::submit`].
+    /// The field of the request that can't be used, the limit that is exceeded, or the master has ended.
     pub async fn draw(
         &self,
         request: PathRequest,

@@ -20,7 +20,7 @@ use tokio::sync::mpsc;
 /// Writes files of pictures and movies into folders of their own.
 pub(crate) struct PageFiles;
 
-/// What a format of the page is here.
+/// Kind of file that a format of the page makes.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Kind {
     /// One file by a writer of `render`.

@@ -1,5 +1,5 @@
-//! What writes files that people keep. A master's page draws frames; whoever starts it knows file
-//! formats.
+//! Interface to the writer of files that people keep: pictures and movies. This crate draws frames; the
+//! program that starts it brings the writer.
 
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::volume::VolumeInfo;
@@ -11,7 +11,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use tokio::sync::mpsc;
 
-/// What a file is to hold.
+/// Description of a file to write: scene, format and number of frames.
 #[derive(Clone, Debug)]
 pub struct Recipe {
     /// Scene of the frames.
@@ -32,9 +32,9 @@ pub struct Recipe {
 
 /// A file that was written.
 pub struct MadeFile {
-    /// Where it lies.
+    /// Path of the file.
     pub path: PathBuf,
-    /// Name for whoever keeps it.
+    /// Name under which a browser saves it.
     pub name: String,
     /// MIME type.
     pub kind: &'static str,

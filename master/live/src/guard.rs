@@ -1,13 +1,13 @@
-//! Who may call: names of this machine in `Host`, pages of this master in `Origin`, and a token.
+//! Access checks of HTTP requests: `Host` must name this machine, `Origin` a page of this master, and
+//! the token must be right.
 //!
-//! A page of a stranger may have the browser call this master under a name that the stranger's name
-//! server points here (DNS rebinding). Addresses can't be pointed, so each literal of this machine is
-//! taken; names have to be known.
+//! Against DNS rebinding, where a stranger's page calls this master under a name of the stranger's: host
+//! names must be known ones. Address literals can't be rebound, so all of this machine are accepted.
 
 use sha2::{Digest, Sha256};
 use std::net::{IpAddr, SocketAddr};
 
-/// Names and tokens that a master takes.
+/// Host names, origins and token that a master accepts.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Guard {
     /// Names of this machine, and those that were allowed, in lower case and without port.

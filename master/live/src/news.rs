@@ -46,7 +46,7 @@ impl Snapshot {
     }
 }
 
-/// What a session was told.
+/// Jobs, workers and volumes as they were last sent to a session; changes are found against it.
 #[derive(Default)]
 pub(crate) struct News(BTreeMap<&'static str, Entries>);
 

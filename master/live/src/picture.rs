@@ -56,7 +56,7 @@ pub(crate) fn path_of(view: &View, scene: &Scene, size: [u32; 2]) -> ViewPath {
     still_path(&view.camera, size, scene.crop, [scene.up, scene.front])
 }
 
-/// What a pass needs to be drawn.
+/// Order to draw one pass: its request, and the encodings that the client reads.
 pub(crate) struct Order {
     pub(crate) pair: Pair,
     pub(crate) pass: Pass,
@@ -77,7 +77,7 @@ pub(crate) struct Early {
     pub(crate) tiles: Vec<bytes::Bytes>,
 }
 
-/// What of a still was sent while it was drawn.
+/// Blocks and bytes of a still that were sent before its frame was done.
 struct Sent {
     blocks: Blocks,
     bytes: usize,
@@ -160,7 +160,7 @@ pub(crate) async fn frame_of(
 /// while others are drawn.
 ///
 /// # Errors
-/// Those of [`frame_of`], or an encoder refuses the pixels.
+/// The request is refused, its frame failed, or an encoder refuses the pixels.
 async fn still_of(
     shared: &Shared,
     order: &Order,
@@ -222,7 +222,7 @@ async fn encoding<T: Send + 'static>(
 /// Draws and encodes a pass.
 ///
 /// # Errors
-/// Those of [`frame_of`].
+/// The request is refused, its frame failed, or an encoder refuses the pixels.
 pub(crate) async fn draw(
     shared: Arc<Shared>,
     order: Order,

@@ -10,11 +10,11 @@ const BUDGET_MS: f64 = 33.0;
 /// Milliseconds from which on a still is shown quickly first, in a moving pass.
 pub(crate) const SLOW_MS: f64 = 150.0;
 
-/// What the next coarser rung takes of a rung's time where nobody measured it: 0.2 to 0.6 on mri256
+/// Predicted time of a rung over that of the next finer one, until it is measured: 0.2 to 0.6 on mri256
 /// and CTs.
 const RATIO: f64 = 0.45;
 
-/// Where no rung fits, one that takes so much of the quickest one's time is as good.
+/// If no rung fits the budget, a rung is taken whose time is at most this multiple of the quickest one's.
 const HARDLY: f64 = 1.3;
 
 /// Passes in time after which a finer rung is tried.
@@ -26,7 +26,7 @@ const LATE_IN_A_ROW: u32 = 2;
 /// Most rungs by which a slow link makes passes coarser than the time of drawing asks for.
 const MOST_PENALTY: usize = 2;
 
-/// How a pass is drawn.
+/// Level and size of a pass.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Setting {
     /// Levels coarser than all detail.

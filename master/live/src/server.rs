@@ -136,7 +136,7 @@ pub(crate) async fn stopped(stop: &mut watch::Receiver<bool>) {
     let _ = stop.wait_for(|stop| *stop).await;
 }
 
-/// Who calls, and which address of this machine.
+/// Addresses of a request: the caller's, and the one of this machine that it called.
 #[derive(Clone, Copy)]
 pub(crate) struct Caller {
     pub(crate) peer: SocketAddr,

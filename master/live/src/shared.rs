@@ -1,4 +1,4 @@
-//! What all sessions and calls of a master's page share.
+//! State shared by all sessions and HTTP calls of a master's page.
 
 use crate::files::Files;
 use crate::guard::Guard;
@@ -30,7 +30,7 @@ pub struct LiveConfig {
     pub allowed_hosts: Vec<String>,
     /// Token that a page has to know; `None` asks for none.
     pub token: Option<String>,
-    /// What is shown first.
+    /// Scene of the first picture.
     pub home: Home,
 }
 

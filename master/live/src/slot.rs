@@ -51,7 +51,7 @@ impl Pass {
     }
 }
 
-/// What is to be done now.
+/// Next step of a slot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Step {
     /// Begin to draw a pass.
@@ -75,7 +75,7 @@ pub(crate) struct Slot {
     delivered: Option<(Pair, Pass)>,
     /// A pair that can't be drawn.
     failed: Option<Pair>,
-    /// Since when stills were dropped and nothing was delivered.
+    /// Time of the first dropped still since a pass was last delivered.
     dropped_since: Option<Micros>,
 }
 

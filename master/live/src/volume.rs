@@ -149,12 +149,12 @@ fn rounded(x: f64, decimals: i32) -> f64 {
     (x / unit).round() * unit
 }
 
-/// What a master shows first.
+/// Scene that a page shows first.
 #[derive(Clone, Debug, Default)]
 pub struct Home {
     /// Preset of the first picture; default `auto`.
     pub tf: Option<String>,
-    /// What a command line names as the volume, where that is more than its name.
+    /// Path that command lines give for the volume; `None`: its name.
     pub file: Option<String>,
 }
 

@@ -33,7 +33,7 @@ pub(crate) struct ActiveJob {
     pub(crate) next: u64,
     /// Number of frames that were begun, repeated ones included.
     pub(crate) begun: u64,
-    /// Who is told of a frame's tiles before the frame is done.
+    /// Receiver of tiles before their frame is done; `None` for jobs of clients.
     pub(crate) tiles: Option<mpsc::Sender<DrawnTile>>,
 }
 

@@ -86,7 +86,7 @@ pub(crate) struct Plan {
     volume: VolumeInfo,
     /// Digest of the volume that was asked for.
     asked: Digest32,
-    /// Who is told of a frame's tiles before the frame is done; `None` from [`Plan::new`].
+    /// Receiver of tiles before their frame is done; `None` for jobs of clients.
     pub(crate) tiles: Option<mpsc::Sender<DrawnTile>>,
 }
 

@@ -323,7 +323,7 @@ pub(super) async fn accept(
 /// First bytes of an HTTP/2 connection.
 const PREFACE_BYTES: &[u8; 24] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 
-/// What a connection speaks, by its first bytes.
+/// Protocol of a connection, told by its first bytes.
 enum Speaks {
     Http2,
     Other,

@@ -54,7 +54,7 @@ pub async fn serve(
 /// without it they are closed.
 ///
 /// # Errors
-/// Those of [`serve`].
+/// The reflection service can't be built, or the server fails.
 pub async fn serve_with_pages(
     handle: Handle,
     listener: TcpListener,

@@ -22,7 +22,7 @@ type Priority = (FrameId, bool, u64);
 struct State {
     /// Tasks that wait, by the number of their client.
     clients: BTreeMap<u64, BTreeMap<Priority, Task>>,
-    /// Whose turn it is.
+    /// Thread time of each client, which decides the next task.
     shares: Shares,
     last_number: u64,
     /// Regions in the queue whose bricks were not asked for in advance.

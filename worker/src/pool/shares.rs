@@ -1,5 +1,5 @@
-//! Whose tile a render thread takes next: clients get equal thread time, and clients whose pictures a
-//! person waits for come before those of jobs. Pure; times come in.
+//! Fair shares of render threads. Clients get equal thread time, and live clients, whose pictures a person
+//! waits for, come before clients with jobs. Pure: callers pass times in.
 //!
 //! Clients are of two classes, by their number ([`is_live`]). While both have tiles that wait, live
 //! ones get [`LIVE_PARTS`] of [`ALL_PARTS`] of the thread time, and jobs the rest: a live frame waits for

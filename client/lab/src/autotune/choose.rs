@@ -63,8 +63,7 @@ pub struct Chosen {
 
 /// Returns the settings to try for pictures of `size` pixels, from fast to exact.
 ///
-/// They come from the Pareto fronts of `slabcast lab report` (docs/measurements/accuracy.md):
-/// 16-bit sums with eps falling as sheets become thin, then 32-bit sums where 16 bits round too
+/// The ladder follows the Pareto fronts of `slabcast lab report` (docs/measurements/accuracy.md): 16-bit sums with eps falling as sheets become thin, then 32-bit sums where 16 bits round too
 /// much. 16 bits are tried only where a sheet fits them.
 pub(super) fn ladder(base: &Setting, size: [u32; 2]) -> Vec<Setting> {
     let b = base.quality;

@@ -78,7 +78,7 @@ pub(crate) mod code {
 /// Why a session ends: a close code, and words.
 struct End(u16, String);
 
-/// What a task of a session brings.
+/// Result of a task that a session started.
 pub(super) enum Outcome {
     /// A volume was opened, or not.
     Opened { open: Box<Opening>, result: Result<Option<Box<Shown>>, Problem> },
@@ -140,7 +140,7 @@ struct Session {
     early: (mpsc::Sender<Early>, mpsc::Receiver<Early>),
     /// The last still, and its request: the same again need not be drawn.
     frame: Option<(PathRequest, Arc<FinishedFrame>)>,
-    /// When passes were sent, for the pace.
+    /// Passes with the time at which each was sent; acknowledgements give the client's pace.
     sent: VecDeque<(Pair, Pass, Instant)>,
     painted_at: Option<Instant>,
     queue: VecDeque<Queued>,
@@ -303,7 +303,7 @@ async fn begin(
     Ok((session, hello))
 }
 
-/// What woke the session.
+/// Event for which a session's loop waits.
 enum Woken {
     Received(Option<Result<Message, axum::Error>>),
     Done(Option<Result<Outcome, tokio::task::JoinError>>),

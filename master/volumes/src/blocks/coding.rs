@@ -385,7 +385,7 @@ impl Coding {
     /// Checks that slope and intercept keep values finite.
     ///
     /// # Errors
-    /// They take the values out of the range of numbers.
+    /// Slope or intercept is zero, subnormal, infinite or NaN as the file states it.
     pub(crate) fn check(&self) -> Result<(), Problem> {
         let map = self.map();
         match map.scale.is_normal() && map.offset.is_finite() {

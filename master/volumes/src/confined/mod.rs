@@ -34,9 +34,9 @@ const STDERR_MAX_BYTES: u64 = 300;
 pub(crate) struct Parser<'a> {
     /// Name of the format.
     pub(crate) name: &'static str,
-    /// What the samples are called in errors, such as `slices`.
+    /// Word for the samples in errors, such as `slices`.
     pub(crate) samples: &'static str,
-    /// What states slope and intercept.
+    /// Field that states slope and intercept, as errors name it.
     pub(crate) rescale: &'static str,
     /// Remedy where the parser fails or the file is damaged.
     pub(crate) remedies: [&'static str; 2],

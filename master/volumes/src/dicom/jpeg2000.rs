@@ -128,7 +128,7 @@ fn be(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0, |n, b| n << 8 | u64::from(*b))
 }
 
-/// What the header says.
+/// Precision, size and tiling of a picture, from its header.
 struct Header {
     precision: u8,
     signed: bool,

@@ -8,7 +8,7 @@ use crate::units::{Step, millimetres, steps_in_mm};
 use glam::DVec3;
 use slabcast_common::volume::Lattice;
 
-/// What an axis is.
+/// Role of an axis: space, time or channel.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) enum Role {
     /// The file does not say.

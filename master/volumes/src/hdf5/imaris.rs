@@ -10,7 +10,7 @@ use crate::units::Step;
 
 const FINEST: &str = "DataSet/ResolutionLevel 0";
 
-/// What the file says of the picture.
+/// Extents and unit of an Imaris picture, from its attributes.
 pub(super) struct Imaris {
     /// Least and greatest coordinate along x, y and z.
     extents: [[f64; 2]; 3],

@@ -1,4 +1,4 @@
-//! What programs write beside any dataset: ilastik's `axistags`, labels of dimensions, and distances in
+//! Axes from attributes of datasets: ilastik's `axistags`, labels of dimensions, and distances in
 //! `element_size_um` (Fiji, ilastik) and `resolution` (CREMI and others, mostly with `units`).
 
 use super::axes::{Axis, Role};

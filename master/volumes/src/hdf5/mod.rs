@@ -40,7 +40,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
     PLACES.iter().any(|at| head.get(*at..).is_some_and(|rest| rest.starts_with(MAGIC)))
 }
 
-/// What is read of a file.
+/// Selection of a dataset and of one volume in it.
 #[derive(Clone, Debug, Default)]
 pub struct Choice {
     /// Path of the dataset; `None` takes the volume of a known use of the format, else the largest of

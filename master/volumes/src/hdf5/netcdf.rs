@@ -11,7 +11,7 @@ use crate::samples::DIM_MAX;
 use crate::units::Step;
 use hdf5_reader::Dataset;
 
-/// What the file calls a dimension without coordinates.
+/// Beginning of `NAME` of a netCDF dimension without coordinates.
 const NO_VARIABLE: &str = "This is a netCDF dimension but not a netCDF variable";
 /// Most difference of two steps along an axis, as a part of the mean.
 const UNEVEN: f64 = 1e-3;

@@ -24,7 +24,7 @@ pub(super) enum Scale {
     Slices { axes: usize, lines: Vec<[f64; 2]> },
 }
 
-/// How the stored numbers of a dataset become values.
+/// Map from the stored numbers of a dataset to values.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Values {
     pub(super) scale: Scale,

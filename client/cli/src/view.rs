@@ -73,6 +73,13 @@ pub(crate) fn run(args: &ViewArgs) -> Result<(), Fail> {
     args.axes.orientation()?;
     let crew = WorkerGroup::new(args.workers.unwrap_or(1), args.threads)?;
     let is_known = presets::NAMES.iter().chain(&presets::MAPS).any(|(name, _)| *name == args.tf);
+    if !is_known && Path::new(&args.tf).is_file() {
+        return Err(Fail::usage(format!(
+            "--tf: `{0}` is a file, and a page begins with a preset; give a preset's name, or draw pictures \
+             with `slabcast render --tf {0}`",
+            args.tf
+        )));
+    }
     if !is_known {
         return Err(Fail::flag(&presets::unknown_name(&args.tf)));
     }

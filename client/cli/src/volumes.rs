@@ -92,7 +92,8 @@ pub(crate) fn put(args: &PutArgs) -> Result<(), Fail> {
     let volume = args.input.open(&args.volume)?;
     let orientation = args.axes.for_volume(&volume)?;
     let name = args.name.clone().unwrap_or_else(|| volume.name.clone());
-    let told = |there, total| progress.uploaded(there, total, &format!("{name} to {address}"));
+    let told =
+        |there, total| progress.bytes_done(there, total, &format!("sending {name} to {address}"));
     let put = runtime.block_on(async {
         signals::listen();
         tokio::select! {

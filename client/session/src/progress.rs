@@ -138,11 +138,11 @@ impl Progress {
         }
     }
 
-    /// Shows how much of an upload is there, in bytes; `what` is the line for a log.
-    pub fn uploaded(&mut self, there: u64, total: u64, what: &str) {
+    /// Shows how many of `total` bytes are done; `what` is the line for a log, such as `reading a.nrrd`.
+    pub fn bytes_done(&mut self, there: u64, total: u64, what: &str) {
         let mib = |bytes: u64| bytes.div_ceil(1 << 20);
         if self.total == 0 {
-            self.frames(mib(total).max(1), &format!("sending {what}, {}", bytes(total)));
+            self.frames(mib(total).max(1), &format!("{what}, {}", bytes(total)));
         }
         self.step(Step { frames: there >> 20, ..Step::default() });
     }

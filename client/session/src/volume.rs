@@ -158,7 +158,7 @@ impl InputArgs {
         let mut bar = None;
         let mut told = |there: u64, total: u64| {
             let bar = bar.get_or_insert_with(|| Progress::new(false).counting("MiB"));
-            bar.uploaded(there, total, &format!("{}: first pass", path.display()));
+            bar.bytes_done(there, total, &format!("reading {}", path.display()));
         };
         let opened = source(path, &self.hints(), Packed::Converted, &mut told);
         if let Some(bar) = bar {

@@ -412,6 +412,12 @@ impl Axes {
                 (kind, _) => ("kinds", quoted(kind.unwrap_or(&"none"))),
             };
             let size = sizes[axis];
+            let left: Vec<String> =
+                (0..count).filter(|&a| !outside_space(a)).map(|a| sizes[a].to_string()).collect();
+            let flat = match &left[..] {
+                [width, height] => format!("; the rest is a 2-D picture of {width} x {height}"),
+                _ => String::new(),
+            };
             let which = match ["the first axis", "the second axis", "the third axis"].get(axis) {
                 Some(which) => which.to_string(),
                 None => format!("axis {}", axis + 1),
@@ -419,7 +425,7 @@ impl Axes {
             Problem::unsupported(
                 fields.with_line(field),
                 format!(
-                    "{which} of {list} is no axis of space: {is}, {size} sample{}",
+                    "{which} of {list} is no axis of space: {is}, {size} sample{}{flat}",
                     if size == 1 { "" } else { "s" }
                 ),
                 match field {

@@ -63,7 +63,7 @@ fn dicom_series_are_not_refused_without_need() {
 fn nrrd_and_metaimage_axes_are_those_of_space() {
     let Some(path) = fault("11-nrrd-vector-axis-as-x/rgb_2d.nrrd") else { return };
     let e = open(&path).unwrap_err().to_string();
-    assert!(e.contains("is no axis of space"), "{e}");
+    assert!(e.contains("is no axis of space") && e.contains("a 2-D picture of 20 x 24"), "{e}");
     // Three bytes a voxel are colours.
     let Some(path) = fault("11-nrrd-vector-axis-as-x/list_one_slice.nrrd") else { return };
     let opened = open(&path).unwrap_or_else(|e| panic!("{e}"));

@@ -33,6 +33,7 @@ impl FrameCheck {
         let (lo, hi) = info.summary.range();
         let tf = request.transfer.name();
         let summary = &info.summary;
+        let coarse = stats.level.map(|drawn| drawn.level).filter(|&level| level > info.level);
         let why = if summary.nan + summary.infinite == summary.total() {
             no_value(summary)
         } else if stats.voxels.relevant == 0 && lo == hi {
@@ -40,6 +41,8 @@ impl FrameCheck {
             format!("every value of the volume is {value}, and `--tf {tf}` leaves that invisible")
         } else if stats.voxels.relevant == 0 && request.path.crop.is_some() {
             format!("no voxel in the cropping box is visible under `--tf {tf}`; widen --crop")
+        } else if let (0, Some(level)) = (stats.voxels.relevant, coarse) {
+            format!("no voxel of level {level} is visible under `--tf {tf}`; give a finer --level")
         } else if stats.voxels.relevant == 0 {
             let (lo, hi) = (number(lo), number(hi));
             format!(

@@ -297,7 +297,11 @@ fn served(
     let told = |there, total| {
         if there < total || sending.is_some() {
             let bar = sending.get_or_insert_with(|| Progress::new(args.quiet).counting("MiB"));
-            bar.uploaded(there, total, &format!("{} to {}", volume.name, client.address()));
+            bar.bytes_done(
+                there,
+                total,
+                &format!("sending {} to {}", volume.name, client.address()),
+            );
         }
     };
     let put = runtime.block_on(async {

@@ -63,8 +63,9 @@ pub struct Chosen {
 
 /// Returns the settings to try for pictures of `size` pixels, from fast to exact.
 ///
-/// The ladder follows the Pareto fronts of `slabcast lab report` (docs/measurements/accuracy.md): 16-bit sums with eps falling as sheets become thin, then 32-bit sums where 16 bits round too
-/// much. 16 bits are tried only where a sheet fits them.
+/// The ladder follows the Pareto fronts of `slabcast lab report` (docs/measurements/accuracy.md): 16-bit
+/// sums with eps falling as sheets become thin, then 32-bit sums where 16 bits round too much. 16 bits
+/// are tried only where a sheet fits them.
 pub(super) fn ladder(base: &Setting, size: [u32; 2]) -> Vec<Setting> {
     let b = base.quality;
     let short = b.fits_i16();

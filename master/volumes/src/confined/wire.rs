@@ -34,19 +34,6 @@ const KINDS: [(OpenErrorKind, &str); 7] = [
     (OpenErrorKind::Damaged, "damaged"),
 ];
 
-const NUMBERS: [Number; 10] = [
-    Number::U8,
-    Number::I8,
-    Number::U16,
-    Number::I16,
-    Number::U32,
-    Number::I32,
-    Number::U64,
-    Number::I64,
-    Number::F32,
-    Number::F64,
-];
-
 /// Replaces control characters, so that the text is one line.
 fn one_line(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
@@ -102,7 +89,7 @@ impl Preface {
         }
         let mut words = lines.get(1)?.split(' ');
         let number = words.next()?;
-        let number = *NUMBERS.iter().find(|n| n.name() == number)?;
+        let number = Number::named(number)?;
         let mut sizes = words.map(|w| w.parse::<u32>().ok());
         let mut next = || sizes.next().flatten();
         let (dims, flags) = ([next()?, next()?, next()?], [next()?, next()?]);

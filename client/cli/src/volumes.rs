@@ -92,8 +92,14 @@ pub(crate) fn put(args: &PutArgs) -> Result<(), Fail> {
     let volume = args.input.open(&args.volume)?;
     let orientation = args.axes.for_volume(&volume)?;
     let name = args.name.clone().unwrap_or_else(|| volume.name.clone());
-    let told =
-        |there, total| progress.bytes_done(there, total, &format!("sending {name} to {address}"));
+    // The line says nothing of what the master has already.
+    let mut is_sending = false;
+    let told = |there, total| {
+        is_sending |= there < total;
+        if is_sending {
+            progress.bytes_done(there, total, &format!("sending {name} to {address}"));
+        }
+    };
     let put = runtime.block_on(async {
         signals::listen();
         tokio::select! {

@@ -1,7 +1,7 @@
-//! Which blocks of a still are there while it is drawn, and which were sent. Pure.
+//! Bookkeeping of a still's blocks while it is drawn: which have all pixels, and which were sent. Pure.
 //!
-//! Tiles of the protocol have edges on multiples of 16 pixels, those of the renderer anywhere. A block
-//! of 16x16 pixels is sent once all of its pixels came.
+//! The protocol's tiles have edges on multiples of 16 pixels; the renderer's have edges anywhere. So a
+//! block of 16x16 pixels is sent when all of its pixels have come.
 
 use crate::tile::{BLOCK, Part, STILL_EDGE};
 use slabcast_common::occlusion::Rect;

@@ -1,4 +1,4 @@
-//! Messages of the socket from the client, as docs/reference/live.md has them.
+//! Messages from the client over the WebSocket; docs/reference/live.md has units and defaults.
 
 use serde::Deserialize;
 use slabcast_common::image::Background;
@@ -9,7 +9,7 @@ use slabcast_scene::transfer::TransferChoice;
 /// Longest message in bytes.
 pub(crate) const LONGEST: usize = 64 << 10;
 
-/// The part of each message that says what it is.
+/// Fields that every message has or may have: its type and number.
 #[derive(Deserialize)]
 pub(crate) struct Head {
     #[serde(rename = "type")]
@@ -30,7 +30,7 @@ impl Head {
     }
 }
 
-/// `view`.
+/// Message `view`: camera, size and whether a hand moves it.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 pub(crate) struct View {
     pub(crate) seq: u32,
@@ -40,7 +40,7 @@ pub(crate) struct View {
     pub(crate) moving: bool,
 }
 
-/// `scene`. What is left out has its default.
+/// Message `scene`: colours, crop, background and quality. Fields left out have their defaults.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 pub(crate) struct Scene {
     pub(crate) rev: u32,
@@ -76,7 +76,7 @@ impl Scene {
     }
 }
 
-/// `hello`.
+/// Message `hello`, the first of a session: versions, token, volume, size, codecs.
 #[derive(Clone, Debug, Deserialize)]
 pub(crate) struct Hello {
     pub(crate) protocol: [u32; 2],
@@ -95,7 +95,7 @@ pub(crate) struct Hello {
     pub(crate) watch: Vec<String>,
 }
 
-/// `open`.
+/// Message `open`: shows another volume.
 #[derive(Clone, Debug, Deserialize)]
 pub(crate) struct Open {
     pub(crate) volume: String,
@@ -105,7 +105,7 @@ pub(crate) struct Open {
     pub(crate) view: Option<View>,
 }
 
-/// `ack`.
+/// Message `ack`: a pass was painted.
 #[derive(Clone, Debug, Deserialize)]
 pub(crate) struct Ack {
     pub(crate) seq: u32,
@@ -113,14 +113,14 @@ pub(crate) struct Ack {
     pub(crate) pass: String,
 }
 
-/// `fit`.
+/// Message `fit`: asks for target and height that fill the picture.
 #[derive(Clone, Debug, Deserialize)]
 pub(crate) struct FitAsk {
     pub(crate) id: u64,
     pub(crate) camera: Key,
 }
 
-/// `pick`.
+/// Message `pick`: asks which values made a pixel.
 #[derive(Clone, Debug, Deserialize)]
 pub(crate) struct PickAsk {
     pub(crate) id: u64,
@@ -128,7 +128,7 @@ pub(crate) struct PickAsk {
     pub(crate) y: u32,
 }
 
-/// `thumbs`.
+/// Message `thumbs`: asks for thumbnails of presets or jobs.
 #[derive(Clone, Debug, Deserialize)]
 pub(crate) struct Thumbs {
     pub(crate) id: u32,
@@ -144,34 +144,34 @@ fn presets() -> String {
     "presets".into()
 }
 
-/// `watch`.
+/// Message `watch`: subscribes to jobs, workers or volumes.
 #[derive(Clone, Debug, Deserialize)]
 pub(crate) struct WatchAsk {
     pub(crate) of: Vec<String>,
 }
 
-/// `jobs_page`.
+/// Message `jobs_page`: asks for older jobs.
 #[derive(Clone, Debug, Deserialize)]
 pub(crate) struct JobsPage {
     pub(crate) before: String,
     pub(crate) count: usize,
 }
 
-/// `cancel_job`.
+/// Message `cancel_job`: cancels a job.
 #[derive(Clone, Debug, Deserialize)]
 pub(crate) struct CancelJob {
     pub(crate) id: u64,
     pub(crate) job: String,
 }
 
-/// `remove_volume`.
+/// Message `remove_volume`: removes a volume from the master.
 #[derive(Clone, Debug, Deserialize)]
 pub(crate) struct RemoveVolume {
     pub(crate) id: u64,
     pub(crate) volume: String,
 }
 
-/// `ping`.
+/// Message `ping`: asks for a `pong`.
 #[derive(Clone, Debug, Deserialize)]
 pub(crate) struct Ping {
     pub(crate) t: serde_json::Number,

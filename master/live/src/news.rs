@@ -15,10 +15,10 @@ pub(crate) const EVERY: Duration = Duration::from_millis(500);
 /// Entries of a message.
 const ENTRIES: usize = 200;
 
-/// Entries of one kind, by id, as they are told.
+/// Entries of one kind by id, as JSON of the protocol.
 type Entries = BTreeMap<String, Value>;
 
-/// The present state of what is watched, by kind.
+/// Present state of jobs, workers and volumes, for those kinds that a session watches.
 #[derive(Default)]
 pub(crate) struct Snapshot {
     kinds: BTreeMap<&'static str, Entries>,
@@ -51,7 +51,7 @@ impl Snapshot {
 pub(crate) struct News(BTreeMap<&'static str, Entries>);
 
 impl News {
-    /// Returns the messages that tell what changed, and takes it as told.
+    /// Returns messages with the entries that changed since the last call.
     pub(crate) fn changes(&mut self, now: Snapshot) -> Vec<Value> {
         let mut messages = Vec::new();
         for (kind, entries) in now.kinds {
@@ -84,7 +84,7 @@ impl News {
     }
 }
 
-/// Looks at what is watched.
+/// Takes a snapshot of the kinds that a session watches.
 pub(crate) async fn look(shared: &Arc<Shared>, viewer: Viewer, watched: &[String]) -> Snapshot {
     let handle = &shared.handle;
     let mut found = Snapshot::default();
@@ -129,7 +129,7 @@ fn with_ids(entries: Entries, field: &str) -> Entries {
     entries.into_values().map(|entry| (id(&entry), entry)).collect()
 }
 
-/// Returns a job as it is told.
+/// Returns a job's entry as JSON of the protocol.
 pub(crate) fn job_entry(view: &JobView, volume: &str) -> Value {
     let (state, mut message, waits_for) = match &view.state {
         JobState::Queued => ("queued", String::new(), "other jobs come first"),
@@ -176,7 +176,7 @@ fn worker_entry(worker: &Worker, now_ms: u64) -> Value {
     })
 }
 
-/// Returns a volume as it is told.
+/// Returns a volume's entry as JSON of the protocol.
 pub(crate) fn volume_entry(entry: &VolumeEntry) -> Value {
     let (digest, dims, kind) = match &entry.read {
         Some((digest, dims, kind)) => {

@@ -31,8 +31,8 @@ const KEPT_SAMPLES: usize = 64 << 20;
 /// hundred small tiles one large one is made.
 const BATCH: Duration = Duration::from_millis(50);
 
-/// Drawn tiles that wait for their encoding; beyond it they are sent once the picture is done. Those of
-/// 64x64 pixels take 3 MiB.
+/// Drawn tiles that wait for encoding; later ones are sent when the picture is done. Tiles of 64x64 pixels
+/// take 3 MiB.
 const TILES_WAITING: usize = 256;
 
 /// Checks the size of a live picture.

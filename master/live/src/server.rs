@@ -39,8 +39,8 @@ const BODY: Duration = Duration::from_secs(60);
 /// Connections of browsers at a time. A page has a socket and up to six others.
 const CONNECTIONS: usize = 512;
 
-/// Connections of browsers at one address at a time: those of some twenty pages. One that reads nothing
-/// keeps its place, so nobody may have all.
+/// Connections of one address at a time, enough for some twenty pages. A connection that reads nothing
+/// keeps its place, so no address may take all.
 const CONNECTIONS_OF_PEER: usize = 128;
 
 /// Bytes of a request's head.

@@ -24,11 +24,11 @@ const PICTURES: usize = 4;
 pub struct LiveConfig {
     /// Name of the master for people; empty for the machine's.
     pub name: String,
-    /// Name of this machine, which callers may use.
+    /// Name of this machine, accepted as `Host`.
     pub machine: String,
-    /// Other names under which browsers may call: those of proxies.
+    /// Other accepted host names, such as a proxy's.
     pub allowed_hosts: Vec<String>,
-    /// Token that a page has to know; `None` asks for none.
+    /// Token that pages must send; `None`: no token.
     pub token: Option<String>,
     /// Scene of the first picture.
     pub home: Home,
@@ -74,7 +74,7 @@ impl Shared {
         }
     }
 
-    /// Returns a number that nothing else of this master's page has.
+    /// Returns a number that is unique within this master's page.
     pub(crate) fn fresh_id(&self) -> u64 {
         self.last_id.fetch_add(1, Ordering::Relaxed) + 1
     }

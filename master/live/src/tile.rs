@@ -1,4 +1,4 @@
-//! Tiles as browsers get them: header and encoded pixels. Encoding takes milliseconds and runs on
+//! Encoder of tiles: header and encoded pixels of the protocol. Encoding takes milliseconds and runs on
 //! threads of its own.
 
 use crate::slot::{Pair, Pass};
@@ -22,7 +22,7 @@ pub(crate) const STILL_EDGE: u32 = 256;
 /// Pixels of a moving pass above which it is encoded in stripes, on several threads.
 const STRIPE_PIXELS: u32 = 512 * 256;
 
-/// Edges of tiles are multiples of this, as those of blocks of 4:2:0 are.
+/// Tile edges are multiples of this many pixels, like blocks of JPEG with 4:2:0.
 pub(crate) const BLOCK: u32 = 16;
 
 const STILL: u16 = 1;
@@ -36,7 +36,7 @@ pub(crate) struct Codecs {
     pub(crate) webp: bool,
 }
 
-/// A pass as it is sent.
+/// Encoded tiles of a pass.
 pub(crate) struct Encoded {
     pub(crate) tiles: Vec<Bytes>,
     /// SHA-256 of a still's pixels as RGBA.
@@ -134,8 +134,8 @@ pub(crate) fn encode(
     Ok(Encoded { tiles: tiles?, sha256 })
 }
 
-/// Encodes the parts of a still that are left. `parts`: which, and `rgb` the whole picture, of `size`
-/// pixels. Others were sent before, with the first tile of the pass.
+/// Encodes the rectangles `parts` of the finished still `rgb` of `size` pixels. The other parts, the first
+/// tile among them, were sent before.
 ///
 /// # Errors
 /// An encoder refuses the pixels, in words.

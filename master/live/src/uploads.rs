@@ -13,6 +13,7 @@ use axum::http::{Request, StatusCode};
 use serde::Deserialize;
 use serde_json::json;
 use slabcast_master::serve::counted_as;
+use slabcast_volumes::DETACHED_HEADERS;
 use std::collections::BTreeMap;
 use std::io::{Seek, SeekFrom, Write};
 use std::net::IpAddr;
@@ -29,9 +30,6 @@ const MOST_FILES: usize = 10_000;
 
 /// An upload that gets nothing for so long is dropped.
 const IDLE: Duration = Duration::from_secs(600);
-
-/// Endings of headers whose samples lie in another file.
-const HEADERS: [&str; 4] = [".mhd", ".nhdr", ".hdr", ".vti"];
 
 /// The body that begins an upload.
 #[derive(Deserialize)]
@@ -229,7 +227,8 @@ fn to_read(folder: &Path, files: &[(FileOf, u64)]) -> PathBuf {
     if let [(file, _)] = files {
         return folder.join(&file.name);
     }
-    let is_header = |name: &str| HEADERS.iter().any(|end| name.to_lowercase().ends_with(end));
+    let is_header =
+        |name: &str| DETACHED_HEADERS.iter().any(|ending| name.to_lowercase().ends_with(ending));
     let mut headers = files.iter().filter(|(file, _)| is_header(&file.name));
     match (headers.next(), headers.next()) {
         (Some((file, _)), None) => folder.join(&file.name),

@@ -100,7 +100,7 @@ pub use error::{OpenError, OpenErrorKind, Problem};
 pub use numbers::{Beside, FileNumbers};
 pub use pick::Pick;
 pub use raw::RawHints;
-pub use reads::{FORMATS, Flag, ReadFormat, endings, takers};
+pub use reads::{DETACHED_HEADERS, FORMATS, Flag, ReadFormat, endings, takers};
 pub use sketch::histogram_sketch;
 pub use store::BrickStore;
 

@@ -156,6 +156,9 @@ pub(crate) fn remedy() -> String {
     format!("give {} or {last}", others.join(", "))
 }
 
+/// Endings of headers whose samples lie in another file.
+pub const DETACHED_HEADERS: [&str; 3] = [".mhd", ".nhdr", ".hdr"];
+
 /// Returns a format's endings without those that only lengthen another, such as `.vtk.gz`.
 fn shortest(format: &ReadFormat) -> Vec<&'static str> {
     format.endings.iter().filter(|e| !e.ends_with(".gz")).take(3).copied().collect()

@@ -3,7 +3,7 @@
 //!
 //! Clients are of two classes, by their number ([`is_live`]). While both have tiles that wait, live
 //! ones get [`LIVE_PARTS`] of [`ALL_PARTS`] of the thread time, and jobs the rest: a live frame waits for
-//! no job, and a job ends however long somebody turns a picture. A class alone gets all. Within a class
+//! no job, and a job ends even while a picture is turned all the time. A class alone gets all. Within a class
 //! the client with the least time comes first.
 
 use slabcast_common::message::is_live;

@@ -1,4 +1,4 @@
-//! A session: one page, its slot, and what it is told.
+//! A session: the master's end of one page's WebSocket.
 //!
 //! One task owns the state. It reads messages, begins passes, and queues what goes out; a second task
 //! writes to the socket, so that a slow link never keeps messages from being read. What is slow

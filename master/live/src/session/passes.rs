@@ -1,4 +1,4 @@
-//! A session's passes: how they begin, how their tiles are queued, and how they end.
+//! Passes of a session: beginning, queueing of tiles, end.
 
 use super::{Outcome, Queued, Session, text};
 use crate::picture::{self, Drawn, Early, Order, request_of};
@@ -15,8 +15,8 @@ use tokio::task::AbortHandle;
 /// its next batch.
 pub(super) const EARLY_BATCHES: usize = 2;
 
-/// Messages that wait to be written beyond which no tiles are taken of a still that is being drawn: some
-/// of its batches. Whoever reads slowly gets larger tiles, at the end.
+/// Messages in the session's queue beyond which a still in progress sends no tiles: a few batches. A slow
+/// client gets larger tiles when the still is done.
 pub(super) const EARLY_WAITING: usize = 64;
 
 /// A pass that is being drawn.
@@ -30,7 +30,7 @@ pub(super) struct Drawing {
 }
 
 impl Session {
-    /// Queues tiles of the still that is being drawn. Those of a dropped one are left out.
+    /// Queues tiles of the still that is being drawn; tiles of a dropped still are left out.
     pub(super) fn show_early(&mut self, early: Option<Early>) {
         let Some(Early { number, tiles }) = early else { return };
         let drawing = self.drawing.as_ref().filter(|drawing| drawing.number == number);

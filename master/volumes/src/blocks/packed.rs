@@ -7,22 +7,21 @@
 use super::ome_zarr::{OmeZarrSource, OnProgress, write_pyramid};
 use super::planes::Planes;
 use super::raw::{describe, ends, stamp};
-use crate::Hints;
 use crate::error::{OpenErrorKind, Problem};
+use crate::{DETACHED_HEADERS, Hints};
 use sha2::{Digest, Sha256};
 use slabcast_common::volume::Digest32;
 use std::path::Path;
-
-/// Endings of headers whose samples lie in another file.
-const DETACHED: [&str; 4] = ["mhd", "nhdr", "hdr", "img"];
 
 /// Bytes of a pyramid for each byte of level 0: the coarser levels add a seventh.
 const PYRAMID: f64 = 8.0 / 7.0;
 
 /// Returns whether a packed volume may be kept as OME-Zarr in the cache.
 pub(super) fn may_be_converted(path: &Path) -> bool {
-    let ending = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    path.is_file() && !DETACHED.contains(&&*ending)
+    let name = path.to_string_lossy().to_lowercase();
+    // `.img` is the other half of an ANALYZE or NIfTI pair.
+    let mut of_two_files = DETACHED_HEADERS.iter().chain(&[".img"]);
+    path.is_file() && !of_two_files.any(|ending| name.ends_with(ending))
 }
 
 /// Opens a packed file by way of its OME-Zarr picture in `cache`, which is made if it is not there.

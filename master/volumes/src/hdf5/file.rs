@@ -118,8 +118,8 @@ impl Tree {
         self.file.dataset(path).is_ok()
     }
 
-    /// Returns all datasets with their paths, in the order of names, those of a group before its groups. Those that can't be opened are left
-    /// out.
+    /// Returns all datasets with their paths, by name, a group's datasets before its groups. Datasets that
+    /// can't be opened are left out.
     pub(super) fn datasets(&self) -> Result<Vec<(String, Dataset)>, Problem> {
         let root = self.file.root_group().map_err(|e| problem("content", &e))?;
         let (mut out, mut seen) = (Vec::new(), BTreeSet::from([root.address()]));

@@ -9,11 +9,12 @@ fn convergence_prints_orders_and_writes_figures() {
     let look = r#"{"version":1,"domain":"unit","color_space":"linear","opacity_unit":"extinction",
         "colors":[[0,0,0.2,1],[1,1,0.8,0]],"opacities":[[0,0],[1,0.5]],"shading":{"on":false}}"#;
     std::fs::write(&tf, look).expect("a file");
-    let run = |order: &str, more: &[&str]| {
+    // Pixels that are judged; the figures want more than the words.
+    let run = |order: &str, pixels: &str, more: &[&str]| {
         let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
             .args(["lab", "check", "convergence", "formula:ramp:12", "--size", "48x48", "--tf"])
             .arg(&tf)
-            .args(["--azimuth", "25", "--elevation", "20", "--pixels", "128", "--thinnest", "4"])
+            .args(["--azimuth", "25", "--elevation", "20", "--pixels", pixels, "--thinnest", "4"])
             .args(["--classify", order])
             .args(more)
             .output()
@@ -22,7 +23,7 @@ fn convergence_prints_orders_and_writes_figures() {
         String::from_utf8(out.stdout).expect("text")
     };
     let plots = dir.path().join("plots");
-    let lines = run("before", &["--json", "--plot", plots.to_str().expect("a name")]);
+    let lines = run("before", "128", &["--json", "--plot", plots.to_str().expect("a name")]);
     let sweeps: Vec<serde_json::Value> =
         lines.lines().map(|l| serde_json::from_str(l).expect("JSON")).collect();
     assert_eq!(sweeps.len(), 2, "both projections");
@@ -48,13 +49,13 @@ fn convergence_prints_orders_and_writes_figures() {
     let svg = std::fs::read_to_string(plots.join("ramp-12.svg")).expect("a figure");
     assert!(svg.starts_with("<svg") && svg.contains("perspective") && svg.len() < 60 << 10);
 
-    let text = run("before", &["--placement"]);
+    let text = run("before", "32", &["--placement"]);
     for word in ["ortho", "persp", "order", "along the ray", "the paper's form goes to a limit"] {
         assert!(text.contains(word), "{word}: {text}");
     }
 
     // Both orders of classification have a sweep; fields begin at one vox.
-    let lines = run("after", &["--json"]);
+    let lines = run("after", "128", &["--json"]);
     for line in lines.lines() {
         let sweep: serde_json::Value = serde_json::from_str(line).expect("JSON");
         let rmse = |i: usize| sweep["figures"][i]["rmse"].as_f64().expect("a figure");
@@ -62,5 +63,5 @@ fn convergence_prints_orders_and_writes_figures() {
         assert!(rmse(2) < rmse(0) && rmse(2) < 0.3, "{line}");
     }
     assert_eq!(lines.lines().count(), 2, "both projections");
-    assert!(run("after", &[]).contains("i16"));
+    assert!(run("after", "32", &[]).contains("i16"));
 }

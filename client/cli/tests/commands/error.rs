@@ -152,7 +152,7 @@ fn ctrl_c_ends_an_error_measurement_at_once() {
     let dir = tempfile::tempdir().expect("a folder");
     let map = dir.path().join("map.png");
     let mut child = Command::new(env!("CARGO_BIN_EXE_slabcast"))
-        .args(["lab", "error", "formula:spheres:96", "--size", "1024x1024", "--pixels", "all"])
+        .args(["lab", "error", "formula:spheres:64", "--size", "512x512", "--pixels", "all"])
         .args(["--map", map.to_str().expect("text")])
         .stderr(std::process::Stdio::piped())
         .spawn()

@@ -395,6 +395,45 @@ async fn slow_still_comes_tile_by_tile_until_another_view_does() {
     session.pixels(&done);
 }
 
+/// A tile's `bound`.
+fn bound(tile: &[u8]) -> f32 {
+    f32::from_le_bytes(tile[24..28].try_into().expect("four"))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn moving_tiles_tell_how_far_the_last_one_was_off_its_still() {
+    let page = view(&["--tf", "fog"]);
+    let mut session = page.session(json!({})).await;
+    // The first picture comes quickly first: nobody knows how long its still takes.
+    let done = session.until("done").await;
+    assert_eq!((&done["pass"], &done["seq"]), (&json!("moving"), &json!(0)));
+    assert!(session.tiles.iter().all(|tile| bound(tile).is_nan()), "no still was there");
+    session.send(json!({"type": "ack", "seq": 0, "scene": 0, "pass": "moving"})).await;
+    session.still(0).await;
+    assert!(session.tiles.iter().all(|tile| bound(tile) == 0.0));
+    // The comparison ends a moment after the still.
+    let off = async {
+        let (mut off, mut seq) = (f32::NAN, 0u64);
+        while off.is_nan() {
+            seq += 1;
+            session
+                .send(json!({"type": "view", "seq": seq, "camera": camera(20.0), "size": SIZE,
+                "moving": true}))
+                .await;
+            session.tiles.clear();
+            let done = session.until("done").await;
+            assert_eq!((&done["pass"], &done["seq"]), (&json!("moving"), &json!(seq)));
+            off = session.tiles.first().map_or(f32::NAN, |tile| bound(tile));
+            let ack = json!({"type": "ack", "seq": seq, "scene": 0, "pass": "moving"});
+            session.send(ack).await;
+            session.still(seq).await;
+        }
+        off
+    };
+    let off = tokio::time::timeout(PATIENCE, off).await.expect("in time");
+    assert!(off > 0.0 && off < 0.5, "{off}");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn latest_view_wins_and_its_still_always_comes() {
     let page = view(&[]);

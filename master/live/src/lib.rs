@@ -14,6 +14,7 @@
 
 mod assets;
 mod blocks;
+mod compare;
 mod files;
 mod guard;
 mod http;

@@ -2,7 +2,7 @@
 
 use crate::blocks::Blocks;
 use crate::messages::{Scene, View};
-use crate::preview::{RUNGS, SLOW_MS, Setting};
+use crate::preview::{RUNGS, SLOW_MS};
 use crate::problem::Problem;
 use crate::shared::{LIVE_EDGE, LIVE_PIXELS, Shared};
 use crate::slot::{Pair, Pass};
@@ -23,9 +23,15 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 
-/// Samples of a volume of which all bricks are cut while its transfer function is being edited, so
+/// Most samples of a level of which all bricks are cut while a transfer function is being edited, so
 /// that an edit which shows other values cuts none. 64 Mi take some 250 MiB.
 const KEPT_SAMPLES: usize = 64 << 20;
+
+/// Returns the finest level of a volume with so many samples of which all bricks may be kept.
+fn level_kept(samples: usize) -> u32 {
+    // Each level has an eighth of the samples of the one before.
+    (0..).find(|level| samples >> (3 * level).min(63) <= KEPT_SAMPLES).unwrap_or(0)
+}
 
 /// Shortest time between two batches of a still's tiles: each is some frames of a screen, and of a
 /// hundred small tiles one large one is made.
@@ -60,6 +66,8 @@ pub(crate) fn path_of(view: &View, scene: &Scene, size: [u32; 2]) -> ViewPath {
 pub(crate) struct Order {
     pub(crate) pair: Pair,
     pub(crate) pass: Pass,
+    /// How far its pixels may be off the still's, as a share of full scale; NaN if unknown.
+    pub(crate) bound: f32,
     pub(crate) request: PathRequest,
     pub(crate) codecs: Codecs,
     /// The frame, if it was drawn before.
@@ -91,16 +99,17 @@ pub(crate) fn request_of(
     (pass, rung): (Pass, usize),
     edited: bool,
 ) -> PathRequest {
-    let Setting { level, divisor } = RUNGS[rung];
-    let size = view.size.map(|n| n.div_ceil(divisor).max(1));
+    let setting = RUNGS[rung];
     let info = shown.info();
-    let level = match (rung, shown.is_large) {
-        (0, true) => LevelChoice::Auto,
-        _ => LevelChoice::At(level),
+    let kept = if edited { level_kept(info.lattice.len()) } else { 0 };
+    let level = match shown.is_large {
+        true => LevelChoice::Auto,
+        false => LevelChoice::At(setting.level.max(kept)),
     };
     let transfer = scene.tf.clone().unwrap_or_else(|| shown.home_tf.clone());
-    let is_small = info.lattice.len() <= KEPT_SAMPLES;
-    let keep = Keep { empty: edited && is_small, ..Keep::default() };
+    let keep = Keep { empty: edited && !shown.is_large, ..Keep::default() };
+    let usual = Quality::default();
+    let quality = Quality { thickness: setting.thickness.unwrap_or(usual.thickness), ..usual };
     let background = match scene.background {
         // Live pictures are opaque.
         Background::Transparent => black(),
@@ -110,9 +119,9 @@ pub(crate) fn request_of(
         client_key: String::new(),
         volume: shown.choice(),
         level,
-        path: path_of(view, scene, size),
+        path: path_of(view, scene, setting.size(view.size)),
         transfer: as_read_from_file(transfer, info),
-        quality: Quality::default(),
+        quality,
         // A still says how far it may be off, which costs up to a quarter of its time.
         work: Work { keep, estimate: pass == Pass::Still, ..Work::default() },
         format: PixelFormat::Rgb8,
@@ -238,12 +247,13 @@ pub(crate) async fn draw(
         None if pass == Pass::Still => still_of(&shared, &order, session, viewer).await?,
         None => (frame_of(&shared, &order.request, session, viewer).await?, None),
     };
-    // Bricks that had to be sent at first say nothing of the next frame.
-    let FrameMs { distribute, overlap, .. } = frame.stats.ms;
+    // Bricks that had to be cut and sent at first say nothing of the next frame. They are cut before its
+    // time begins.
+    let FrameMs { total, distribute, overlap, .. } = frame.stats.ms;
     let draw_ms = ms(began);
-    let steady_ms = (draw_ms - (distribute - overlap).max(0.0)).max(0.0);
+    let steady_ms = (total - (distribute - overlap).max(0.0)).max(0.0);
     let encoding_began = Instant::now();
-    let bound = if pass == Pass::Still { 0.0 } else { f32::NAN };
+    let bound = order.bound;
     let pixels = frame.clone();
     let early_bytes = sent.as_ref().map_or(0, |sent| sent.bytes);
     let encode = move || {

@@ -86,6 +86,8 @@ pub(super) enum Outcome {
     Drawn { number: u64, result: Result<Box<Drawn>, Problem> },
     /// The present state of what is watched.
     News(crate::news::Snapshot),
+    /// A moving picture of a scene was compared with its still: its rung, and how far it was off.
+    Compared { scene: u32, rung: usize, off: f32 },
     /// A thumbnail was drawn, or not.
     Thumb { id: u32, result: Result<Message, String> },
     /// Messages to be sent.
@@ -138,6 +140,8 @@ struct Session {
     passes: u64,
     /// Tiles of the still that is being drawn.
     early: (mpsc::Sender<Early>, mpsc::Receiver<Early>),
+    /// The last moving picture: its rung, request and frame.
+    previewed: Option<(usize, PathRequest, Arc<FinishedFrame>)>,
     /// The last still, and its request: the same again need not be drawn.
     frame: Option<(PathRequest, Arc<FinishedFrame>)>,
     /// Passes with the time at which each was sent; acknowledgements give the client's pace.
@@ -285,6 +289,7 @@ async fn begin(
         drawing: None,
         passes: 0,
         early: mpsc::channel(passes::EARLY_BATCHES),
+        previewed: None,
         frame: None,
         sent: VecDeque::new(),
         painted_at: None,
@@ -472,6 +477,11 @@ impl Session {
                     self.open(None, true, 0, First::default());
                 }
             }
+            Outcome::Compared { scene, rung, off } => {
+                if scene == self.scene.rev {
+                    self.preview.compared(rung, off);
+                }
+            }
             Outcome::Thumb { id, result } => self.thumb_drawn(id, result),
             Outcome::Say(messages) => {
                 let queued = messages.into_iter().map(|message| Queued { message, pass: None });
@@ -526,6 +536,7 @@ impl Session {
         self.drop_thumb();
         self.slot.clear();
         self.preview = Preview::default();
+        self.previewed = None;
         self.frame = None;
         self.say(&shown.message);
         let shown = Arc::new(shown);

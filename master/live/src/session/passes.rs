@@ -1,11 +1,14 @@
 //! Passes of a session: beginning, queueing of tiles, end.
 
 use super::{Outcome, Queued, Session, text};
+use crate::compare::{Picture, largest_difference};
 use crate::picture::{self, Drawn, Early, Order, request_of};
 use crate::problem::Problem;
 use crate::slot::{Pair, Pass};
 use crate::volume::Shown;
 use axum::extract::ws::Message;
+use slabcast_master::jobs::FinishedFrame;
+use slabcast_scene::path::ViewPath;
 use slabcast_scene::request::PathRequest;
 use std::sync::Arc;
 use std::time::Instant;
@@ -57,7 +60,9 @@ impl Session {
         let number = self.passes;
         let (codecs, early) = (self.codecs, self.early.0.clone());
         let request_of_pass = request.clone();
-        let order = Order { pair, pass, request: request_of_pass, codecs, frame, number, early };
+        let bound = if pass == Pass::Moving { self.preview.off(rung) } else { 0.0 };
+        let order =
+            Order { pair, pass, bound, request: request_of_pass, codecs, frame, number, early };
         let (shared, id, viewer, asked_at) =
             (self.shared.clone(), self.id, self.viewer, self.asked_at);
         let task = self.tasks.spawn(async move {
@@ -86,11 +91,17 @@ impl Session {
             }
         };
         done["threads"] = self.threads.into();
-        if let Some(ms) = steady_ms {
-            self.preview.drawn(rung, ms);
+        match (steady_ms, pass) {
+            (Some(ms), Pass::Moving) => self.preview.drawn(rung, ms),
+            (Some(ms), Pass::Still) => self.preview.still_drawn(ms),
+            (None, _) => {}
         }
-        if pass == Pass::Still {
-            self.frame = Some((request, frame));
+        match pass {
+            Pass::Moving => self.previewed = Some((rung, request, frame)),
+            Pass::Still => {
+                self.compare(pair.scene, &request, &frame);
+                self.frame = Some((request, frame));
+            }
         }
         let tiles = encoded.tiles.into_iter().map(Message::Binary);
         let whole = tiles.chain([text(&done)]);
@@ -99,4 +110,27 @@ impl Session {
         self.slot.delivered();
         self.sent.push_back((pair, pass, Instant::now()));
     }
+
+    /// Has the last moving picture compared with a still of `request`, if both show the same.
+    fn compare(&mut self, scene: u32, request: &PathRequest, still: &Arc<FinishedFrame>) {
+        let Some((rung, _, preview)) = self.previewed.take_if(|(_, of, _)| same_view(of, request))
+        else {
+            return;
+        };
+        let still = still.clone();
+        self.tasks.spawn(async move {
+            let compared = tokio::task::spawn_blocking(move || {
+                let preview = Picture { rgb: &preview.bytes, size: preview.size };
+                largest_difference(preview, Picture { rgb: &still.bytes, size: still.size })
+            });
+            Outcome::Compared { scene, rung, off: compared.await.unwrap_or(f32::NAN) }
+        });
+    }
+}
+
+/// Whether two requests show the same, at whatever size and quality.
+fn same_view(a: &PathRequest, b: &PathRequest) -> bool {
+    let path = ViewPath { size: b.path.size, ..a.path.clone() };
+    (&a.volume, &a.transfer, a.background, path)
+        == (&b.volume, &b.transfer, b.background, b.path.clone())
 }

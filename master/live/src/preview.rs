@@ -67,7 +67,7 @@ pub(crate) const RUNGS: [Setting; 8] = [
     Setting::moving(0, 3.0, 0.16),
     Setting::moving(1, 3.0, 0.09),
     Setting::moving(1, 4.0, 0.06),
-    Setting::moving(2, 4.0, 0.04),
+    Setting::moving(1, 6.0, 0.035),
     Setting::moving(2, 6.0, 0.02),
 ];
 

@@ -12,7 +12,7 @@ import {
   changedStop, emphasised, movedPoint, opacityAt, plainTf, stopHex, windowOf, withLight, withPoint,
   withStop, withWindow, withoutPoint, withoutStop,
 } from "./tf.js";
-import { decodeTile } from "./wire.js";
+import { decodedOrNull } from "./wire.js";
 
 /** @typedef {import("./core.js").Core} Core */
 
@@ -62,7 +62,7 @@ export function colourPanel(core, overlay) {
   core.wire.on("tile", async (t) => {
     const entry = t.thumb && t.seq === thumbId && buttons.get(thumbNames[t.x]);
     if (!entry) return;
-    const bitmap = await decodeTile(t).catch(() => null);
+    const bitmap = await decodedOrNull(t);
     if (!bitmap) return;
     [entry.canvas.width, entry.canvas.height] = [t.w, t.h];
     entry.canvas.getContext("2d").drawImage(bitmap, 0, 0);

@@ -328,8 +328,12 @@ export class Core extends Signals {
     const doc = this.document();
     const hash = await fragmentOf(doc);
     if (hash.length <= LONGEST_ADDRESS) return hash;
-    const answer = await this.post("v1/states", doc).catch(() => null);
-    return answer?.ok ? `#s,${(await answer.json()).id}` : null;
+    try {
+      const answer = await this.post("v1/states", doc);
+      return answer.ok ? `#s,${(await answer.json()).id}` : null;
+    } catch {
+      return null;
+    }
   }
 
   /**

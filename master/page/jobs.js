@@ -3,7 +3,7 @@
 import { refusalWords } from "./core.js";
 import { bytesWords, download, durationWords, h, icon, setAttr, setText } from "./dom.js";
 import { Rows, applyDelta } from "./rows.js";
-import { decodeTile } from "./wire.js";
+import { decodedOrNull } from "./wire.js";
 
 /** @typedef {import("./core.js").Core} Core */
 
@@ -120,7 +120,7 @@ export function jobsPanel(core, announce) {
   core.wire.on("tile", async (t) => {
     if (!t.thumb || t.seq !== thumbId) return;
     const name = names[t.x];
-    const bitmap = await decodeTile(t).catch(() => null);
+    const bitmap = await decodedOrNull(t);
     if (!bitmap || !name) return;
     pictures.set(name, bitmap);
     if (pictures.size > 400) {

@@ -171,7 +171,7 @@ export function bytesOfBase64url(text) {
 }
 
 /**
- * @param {Uint8Array} bytes
+ * @param {Uint8Array<ArrayBuffer>} bytes
  * @param {any} through
  */
 async function piped(bytes, through) {

@@ -19,13 +19,15 @@ import { decodedOrNull } from "./wire.js";
 const THUMB_PX = 96;
 /** Presets that are seen before the list is opened: two rows. */
 const FIRST_PRESETS = 8;
+/** @type {Record<string, import("./types.js").Shading["light"]>} */
+const LIGHTS = { key: "key", head: "head", world: [1, 1, 1] };
 
 /**
  * @param {Core} core
  * @param {import("./overlay.js").Overlay} overlay
  */
 export function colourPanel(core, overlay) {
-  const range = () => /** @type {import("./types.js").Volume} */ (core.volume).range;
+  const range = () => core.opened.range;
   const put = (/** @type {any} */ tf, /** @type {string} */ tag) => core.change({ tf }, tag);
 
   // Presets.
@@ -72,7 +74,7 @@ export function colourPanel(core, overlay) {
     buttons.clear();
     grid.replaceChildren();
     maps.replaceChildren();
-    for (const preset of core.volume.presets) {
+    for (const preset of core.opened.presets) {
       if (preset.name.startsWith("peer-")) continue;
       const canvas = h("canvas", { width: THUMB_PX, height: THUMB_PX, "aria-hidden": "true" });
       const button = h("button", {
@@ -159,8 +161,7 @@ export function colourPanel(core, overlay) {
 
   // Light.
   const light = segments("Light", [["key", "Key"], ["head", "Eye"], ["world", "World"], ["off", "Off"]], (v) => {
-    const patch = v === "off" ? { on: false } : { on: true, light: v === "world" ? [1, 1, 1] : v };
-    put(withLight(core.state.tf, patch), "");
+    put(withLight(core.state.tf, v === "off" ? { on: false } : { on: true, light: LIGHTS[v] }), "");
   });
   const lightFields = ["ambient", "diffuse", "specular", "power"].map((name) => {
     const field = numberField({
@@ -172,8 +173,8 @@ export function colourPanel(core, overlay) {
   });
   const direction = ["x", "y", "z"].map((name, i) => numberField({
     label: name, step: 0.1, onchange: (x) => {
-      const now = core.state.tf.shading.light;
-      const next = Array.isArray(now) ? [...now] : [1, 1, 1];
+      const now = core.state.tf.shading?.light;
+      const next = /** @type {import("./types.js").Vec3} */ (Array.isArray(now) ? [...now] : [1, 1, 1]);
       next[i] = x;
       if (next.some((c) => c !== 0)) put(withLight(core.state.tf, { light: next }), "");
       else core.note("warning", "A light needs a direction that is not 0, 0, 0.");
@@ -204,7 +205,7 @@ export function colourPanel(core, overlay) {
         h("button", { type: "button", "aria-label": `More of ${name}`, text: "More", onclick: act(1.6) }),
         h("button", { type: "button", "aria-label": `Less of ${name}`, text: "Less", onclick: act(0.4) }));
     });
-    const unit = core.volume.unit;
+    const unit = core.opened.unit;
     picked.replaceChildren(
       h("header", {}, h("h2", { text: `Pixel ${m.x}, ${m.y}` }), close),
       m.hit ? h("p", { text: `Surface at ${m.hit.map((/** @type {number} */ x) => numberWords(x, 4)).join(", ")}${unit && ` ${unit}`}, value ${numberWords(m.value, 4)}` })
@@ -275,7 +276,7 @@ export function colourPanel(core, overlay) {
     put(gradientOn.checked ? { ...rest, gradient_opacity: [[round2(most * 0.05), 0],
       [round2(most * 0.3), 1]] } : rest, "");
   } });
-  const mostGradient = () => core.volume.gradients?.to ?? (range()[1] - range()[0]) / 2 / voxOf(core.volume);
+  const mostGradient = () => core.opened.gradients?.to ?? (range()[1] - range()[0]) / 2 / voxOf(core.opened);
   const border = new BorderView((points, moving) => core.change({ tf: { ...core.state.tf,
     gradient_opacity: points } }, moving ? "tf-border" : "", moving), () => core.settle());
   const round2 = (/** @type {number} */ x) => Number(x.toPrecision(2));
@@ -337,7 +338,7 @@ export function colourPanel(core, overlay) {
     const points = state.tf.gradient_opacity;
     gradientOn.checked = !!points;
     border.el.toggleAttribute("hidden", !points);
-    border.set(points ?? [], mostGradient(), core.volume.gradients);
+    border.set(points ?? [], mostGradient(), core.opened.gradients);
     gradientPoints.forEach((g) => { g.input.disabled = !points; });
     gradientPoints[0].set(points ? points[0][0] : null);
     gradientPoints[1].set(points ? points[points.length - 1][0] : null);

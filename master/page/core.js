@@ -20,6 +20,16 @@ import { Signals, Wire } from "./wire.js";
 const SETTLE_MS = 80;
 const TOKEN_KEY = "slabcast-token";
 
+/**
+ * @template T
+ * @param {T|null} x
+ * @returns {T}
+ */
+function present(x) {
+  if (x === null) throw new Error("There is no volume yet.");
+  return x;
+}
+
 export class Core extends Signals {
   constructor() {
     super();
@@ -69,9 +79,11 @@ export class Core extends Signals {
     });
   }
 
-  /** @returns {State} */
-  get state() { return /** @type {Steps} */ (this.steps).now; }
-  get axes() { return axesOfState(this.state, /** @type {Volume} */ (this.volume)); }
+  /** The state. Throws before a volume is there, as `opened` does; `steps` is null till then. */
+  get state() { return present(this.steps).now; }
+  /** The volume that is shown. Who may come before there is one asks `volume`, which is null then. */
+  get opened() { return present(this.volume); }
+  get axes() { return axesOfState(this.state, this.opened); }
   get token() { return sessionStorage.getItem(TOKEN_KEY); }
   set token(t) { if (t) sessionStorage.setItem(TOKEN_KEY, t); }
   /** @returns {Record<string, string>} */
@@ -305,7 +317,7 @@ export class Core extends Signals {
   /** The document of the address: a still, and the movie's form. */
   document() {
     const { film } = this.state;
-    const doc = documentOf(this.state, /** @type {Volume} */ (this.volume), this.size);
+    const doc = documentOf(this.state, this.opened, this.size);
     return film.keys.length ? { ...doc, film } : doc;
   }
 

@@ -61,7 +61,7 @@ export function listenToHands(stage, core) {
   const zoom = (factor, x, y, cam) => {
     const b = box();
     return zoomedAt(cam, core.axes, factor, x - b.left - b.width / 2, y - b.top - b.height / 2, b.height,
-      heightLimits(/** @type {any} */ (core.volume)));
+      heightLimits(core.opened));
   };
 
   stage.addEventListener("pointerdown", (/** @type {PointerEvent} */ e) => {
@@ -123,12 +123,12 @@ export function listenToHands(stage, core) {
     const [alongX, alongY] = [(e.clientX - gesture.x0) / height, (e.clientY - gesture.y0) / height];
     if (gesture.kind === "opacity") core.change({ tf: fadedBy(gesture.tf, 10 ** (-2 * alongY)) }, "hand-tf", true);
     if (gesture.kind === "window") {
-      const range = /** @type {import("./types.js").Volume} */ (core.volume).core;
+      const range = core.opened.core;
       const [a, b] = windowOf(gesture.tf);
       const span = range[1] - range[0];
       const level = (a + b) / 2 + alongX * span * 0.5;
       const width = clamp((b - a || span / 100) * 4 ** (2 * alongY), span / 1000, 2 * span);
-      core.change({ tf: withWindow(gesture.tf, [level - width / 2, level + width / 2], core.volume.range) },
+      core.change({ tf: withWindow(gesture.tf, [level - width / 2, level + width / 2], core.opened.range) },
         "hand-tf", true);
     }
   });

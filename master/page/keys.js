@@ -99,9 +99,9 @@ function cameraKey(core, e) {
     return put(steppedBy(cam, o, by[0] * step, by[1] * step), "key-turn");
   }
   if (e.altKey) return false;
-  if (e.key === "+" || e.key === "=") return put(zoomedAt(cam, o, 1 / 1.2, 0, 0, 1, heightLimits(core.volume)),
+  if (e.key === "+" || e.key === "=") return put(zoomedAt(cam, o, 1 / 1.2, 0, 0, 1, heightLimits(core.opened)),
     "key-zoom");
-  if (e.key === "-") return put(zoomedAt(cam, o, 1.2, 0, 0, 1, heightLimits(core.volume)), "key-zoom");
+  if (e.key === "-") return put(zoomedAt(cam, o, 1.2, 0, 0, 1, heightLimits(core.opened)), "key-zoom");
   if (e.key === "[") return put(rolledBy(cam, -TURN), "key-lean");
   if (e.key === "]") return put(rolledBy(cam, TURN), "key-lean");
   if (/^[1-6]$/.test(e.key)) {

@@ -123,8 +123,8 @@ core.on("volume", (volume) => {
   document.title = `${volume.name} – slabcast`;
 });
 core.on("state", (state) => {
-  setAttr(byId("undo"), "disabled", core.steps.past.length < 2);
-  setAttr(byId("redo"), "disabled", core.steps.future.length < 1);
+  setAttr(byId("undo"), "disabled", !core.steps?.canUndo);
+  setAttr(byId("redo"), "disabled", !core.steps?.canRedo);
   stage.style.background = state.background;
 });
 /** @type {any} */
@@ -135,14 +135,14 @@ core.on("painted", (m) => {
   // A screen reader is told when the view rests, not at each step of a turn.
   clearTimeout(labelTimer);
   labelTimer = setTimeout(() => {
-    const { state, volume } = core;
+    const { state, opened: volume } = core;
     const look = state.preset ?? "own colours";
     const where = `${look}, ${camWords(state.cam, core.axes, volume.anatomical)}, ${m.pass === "still" ? "sharp" : "moving"}`;
     setAttr(viewer.still, "aria-label", `${volume.name}, ${where}`);
     if (document.activeElement === stage && m.pass === "still") announce(where);
   }, 250);
 });
-core.on("reset", () => core.adopt({ ...core.state, cam: homeState(core.volume).cam }, ""));
+core.on("reset", () => core.adopt({ ...core.state, cam: homeState(core.opened).cam }, ""));
 
 // Turning by itself; never for who asked for less motion.
 let spin = 0;

@@ -57,7 +57,7 @@ export class Overlay {
     el.addEventListener("pointerdown", (/** @type {PointerEvent} */ e) => {
       e.stopPropagation();
       el.setPointerCapture(e.pointerId);
-      const { volume, state } = this.core;
+      const { opened: volume, state } = this.core;
       const ends = cropBox(state.crop, volume.box);
       const at = faceMiddle(ends, axis, side);
       const step = /** @type {Vec3} */ (at.map((x, i) => x + (i === axis ? 1 : 0)));
@@ -68,7 +68,7 @@ export class Overlay {
     });
     el.addEventListener("pointermove", (/** @type {PointerEvent} */ e) => {
       if (!drag) return;
-      const { volume, state } = this.core;
+      const { opened: volume, state } = this.core;
       const pxPerMm = this.rect().height / state.cam.height;
       const by = dragAlong(e.clientX - drag.x, e.clientY - drag.y, drag.ax, drag.ay, pxPerMm);
       this.core.change({ crop: cropWith(state.crop, axis, side, drag.from + by, volume.box) }, `crop${axis}${side}`,
@@ -146,7 +146,7 @@ export class Overlay {
    * @param {number} height
    */
   drawBar(width, height) {
-    const { state, volume } = this.core;
+    const { state, opened: volume } = this.core;
     const k = uiScale();
     const { mm, px } = scaleBar(state.cam.height / height, Math.min(160 * k, width / 4));
     const [x, y] = [width - 16 * k - px, height - 14 * k];
@@ -158,7 +158,7 @@ export class Overlay {
 
   /** @param {number} height */
   drawCube(height) {
-    const { state, axes, volume } = this.core;
+    const { state, axes, opened: volume } = this.core;
     const { right, down, ahead } = eyeAxes(state.cam, axes);
     const letters = axisLetters(volume.anatomical);
     const k = uiScale();
@@ -213,7 +213,7 @@ export class Overlay {
     const { core } = this;
     setAttr(this.box, "display", this.showBox ? null : "none");
     if (!this.showBox) return;
-    const { volume, state, axes } = core;
+    const { opened: volume, state, axes } = core;
     const ends = cropBox(state.crop, volume.box);
     const project = this.project();
     const { ahead } = eyeAxes(state.cam, axes);

@@ -211,6 +211,8 @@ export class Steps {
   }
 
   get now() { return this.past[this.past.length - 1]; }
+  get canUndo() { return this.past.length > 1; }
+  get canRedo() { return this.future.length > 0; }
 
   /**
    * @param {State} state
@@ -235,7 +237,7 @@ export class Steps {
 
   /** @returns {State|null} */
   undo() {
-    if (this.past.length < 2) return null;
+    if (!this.canUndo) return null;
     this.future.push(/** @type {State} */ (this.past.pop()));
     this.tag = "";
     return this.now;

@@ -69,7 +69,7 @@ export class TfView {
 
   /** @returns {[number, number]} values at the left and right end */
   get span() {
-    const { range, core } = /** @type {import("./types.js").Volume} */ (this.core.volume);
+    const { range, core } = this.core.opened;
     if (this.zoom) return this.zoom;
     const [a, b] = [Math.min(range[0], core[0]), core[1]];
     return b > a ? [a, b] : [range[0], range[0] + 1];
@@ -97,7 +97,7 @@ export class TfView {
     };
   }
 
-  get range() { return /** @type {import("./types.js").Volume} */ (this.core.volume).range; }
+  get range() { return this.core.opened.range; }
   get tf() { return this.core.state.tf; }
 
   /**

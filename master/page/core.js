@@ -2,7 +2,8 @@
  * What the page knows and what it tells the master. Changes of the state come in by `change`; out go
  * at most one view and one scene a screen frame, and signals for whoever shows something.
  *
- * Signals: `volume`, `state`, `status`, `done`, `painted`, `hash`, `picked`, `note` {level, text}.
+ * Signals: `welcome`, `volume`, `state`, `status`, `painted`, `progress` {seq, scene, share} of a still
+ * that comes tile by tile, `hash`, `picking`, `fitting`, `reset`, `note` {level, text}.
  */
 
 import { clamp, keyOfCam } from "./camera.js";

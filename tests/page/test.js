@@ -11,6 +11,7 @@ import * as state from "../../master/page/state.js";
 import * as tf from "../../master/page/tf.js";
 import { pairOrder, parseTile, waitBeforeDial } from "../../master/page/wire.js";
 import { applyDelta } from "../../master/page/rows.js";
+import { errorWords, previewWords, stateWords } from "../../master/page/shown.js";
 
 /** @type {[string, () => any][]} */
 const stories = [];
@@ -294,6 +295,21 @@ story("pairs have an order", () => {
 });
 story("dialling again waits longer each time, to a limit", () => {
   same([0, 1, 2, 9].map((n) => waitBeforeDial(n, 0.5)), [250, 500, 1000, 8000]);
+});
+story("a preview says its size, and how far it is off once somebody knows", () => {
+  same(stateWords({ pass: "moving", size: [171, 171] }), "preview 171×171");
+  same([NaN, 0, 0.0001, 0.0017, 5.03 / 255, 9.4 / 255, 9.6 / 255, 23.4 / 255].map(previewWords), ["", "under 0.1/255 off",
+    "under 0.1/255 off", "about 0.4/255 off", "about 5/255 off", "about 9/255 off", "about 10/255 off", "about 23/255 off"]);
+});
+story("a still says how much of it is there, and is not sharp before it is whole", () => {
+  const still = { pass: "still", size: [512, 512] };
+  same([0, 0.624, 0.9999, 1].map((share) => stateWords(still, share)), ["0 % sharp", "62 % sharp", "99 % sharp", "sharp"]);
+  same(stateWords(still), "sharp");
+});
+story("errors of a still are one sum, or nothing while a part is unknown", () => {
+  const [a, b] = [{ value: 0.25, kind: "bound" }, { value: 0.125, kind: "both" }];
+  same([errorWords({ a, b }), errorWords({ a, b: { ...b, kind: "estimate" } }), errorWords({ a, b: null }), errorWords({})],
+    ["at most 0.4/255 off", "about 0.4/255 off", "", ""]);
 });
 story("deltas change, add and remove", () => {
   const known = new Map();

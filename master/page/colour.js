@@ -81,7 +81,7 @@ export function colourPanel(core, overlay) {
         type: "button", class: "preset", title: preset.for, "aria-pressed": "false",
         onclick: () => {
           core.change({ tf: plainTf(preset.tf, range()), preset: preset.name }, "");
-          view.zoom = null;
+          view.zoomTo(null);
         },
       }, canvas, h("span", { text: preset.name }));
       buttons.set(preset.name, { button, canvas, drawn: false });
@@ -91,7 +91,7 @@ export function colourPanel(core, overlay) {
   };
 
   // The curve.
-  const view = new TfView(core, () => drawSelected());
+  const view = new TfView(core, () => drawSelected(), () => setAttr(zoomTo, "aria-pressed", String(view.zoom !== null)));
   const scale = segments("Histogram", [["log", "Log"], ["linear", "Linear"]], (v) => {
     view.log = v === "log";
     scale.set(v);
@@ -109,9 +109,7 @@ export function colourPanel(core, overlay) {
     onclick: () => {
       const [a, b] = windowOf(core.state.tf);
       const wide = Math.max(b - a, (range()[1] - range()[0]) / 200) * 1.5;
-      view.zoom = view.zoom ? null : [clamp(a - wide, ...range()), clamp(b + wide, ...range())];
-      setAttr(zoomTo, "aria-pressed", String(view.zoom !== null));
-      view.draw();
+      view.zoomTo(view.zoom ? null : [clamp(a - wide, ...range()), clamp(b + wide, ...range())]);
     },
   });
 
@@ -159,6 +157,13 @@ export function colourPanel(core, overlay) {
   const to = numberField({ label: "To", onchange: (b) => put(withWindow(core.state.tf,
     [Math.min(b, windowOf(core.state.tf)[0]), b], range()), "") });
 
+  const width = numberField({ label: "Width", onchange: (w) => setWindow(levelOf(), Math.max(w, 0)) });
+  const level = numberField({ label: "Level", onchange: (l) => setWindow(l, widthOf()) });
+  const widthOf = () => { const [a, b] = windowOf(core.state.tf); return b - a; };
+  const levelOf = () => { const [a, b] = windowOf(core.state.tf); return (a + b) / 2; };
+  const setWindow = (/** @type {number} */ l, /** @type {number} */ w) =>
+    put(withWindow(core.state.tf, [l - w / 2, l + w / 2], range()), "");
+
   // Light.
   const light = segments("Light", [["key", "Key"], ["head", "Eye"], ["world", "World"], ["off", "Off"]], (v) => {
     put(withLight(core.state.tf, v === "off" ? { on: false } : { on: true, light: LIGHTS[v] }), "");
@@ -186,16 +191,17 @@ export function colourPanel(core, overlay) {
   const picked = byId("picked");
   let asked = /** @type {any} */ (null);
   core.on("picking", (p) => { asked = p; });
+  core.on("unpick", () => { picked.hidden = true; overlay.setMark(null); view.showPicked([]); });
   core.wire.on("picked", (m) => {
     if (!asked || m.id !== asked.id) return;
-    overlay.setMark({ x: m.x, y: m.y });
+    overlay.setMark(m);
     if (asked.aim) aimAtPicked(core, m);
     view.showPicked(m.ranges);
     drawPicked(m);
   });
   const drawPicked = (/** @type {any} */ m) => {
     const close = h("button", { type: "button", class: "quiet", "aria-label": "Close",
-      onclick: () => { picked.hidden = true; overlay.setMark(null); view.showPicked([]); } }, icon("close"));
+      onclick: () => core.emit("unpick") }, icon("close"));
     const rows = m.ranges.map((/** @type {any} */ r) => {
       const name = `${numberWords(r.from, 4)} to ${numberWords(r.to, 4)}`;
       const act = (/** @type {number} */ k) => () => put(emphasised(core.state.tf, r.from, r.to, k, range()), "");
@@ -303,14 +309,14 @@ export function colourPanel(core, overlay) {
       h("div", { class: "row" }, scale.el, axis.el, zoomTo)),
     h("section", {}, h("header", {}, h("h2", { text: "Window" }),
       h("span", { class: "aside", text: "right-drag on the picture" })),
-      h("div", { class: "fields two" }, from.el, to.el)),
+      h("div", { class: "fields two" }, from.el, to.el, width.el, level.el)),
     h("section", {}, h("header", {}, h("h2", { text: "Light" })), light.el,
       directionRow, h("div", { class: "fields two" }, ...lightFields.map((f) => f.el))),
     h("section", {}, h("header", {}, h("h2", { text: "Borders" })), gradient),
     h("section", {}, table));
 
   core.on("volume", () => {
-    view.zoom = null;
+    view.zoomTo(null);
     picked.hidden = true;
     shown = { tf: null, preset: null, cam: null };
     fillPresets();
@@ -328,6 +334,8 @@ export function colourPanel(core, overlay) {
     const [a, b] = windowOf(state.tf);
     from.set(a);
     to.set(b);
+    width.set(Number((b - a).toPrecision(6)));
+    level.set(Number(((a + b) / 2).toPrecision(6)));
     setText(presetName, state.preset ? "" : "changed");
     for (const [name, { button }] of buttons) setAttr(button, "aria-pressed", String(name === state.preset));
     const s = state.tf.shading;

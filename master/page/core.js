@@ -3,7 +3,8 @@
  * at most one view and one scene a screen frame, and signals for whoever shows something.
  *
  * Signals: `welcome`, `volume`, `state`, `status`, `painted`, `progress` {seq, scene, share} of a still
- * that comes tile by tile, `hash`, `picking`, `fitting`, `reset`, `note` {level, text}.
+ * that comes tile by tile, `hash`, `picking`, `unpick`, `fitting`, `reset`, `told` (words of a drag),
+ * `note` {level, text}.
  */
 
 import { clamp, keyOfCam } from "./camera.js";
@@ -125,6 +126,7 @@ export class Core extends Signals {
     }
     try {
       this.adopt(stateOfDocument(doc, this.volume), "");
+      this.keepAddress(true);
     } catch (e) {
       this.note("warning", /** @type {Error} */ (e).message);
     }
@@ -182,7 +184,7 @@ export class Core extends Signals {
     }
     this.emit("volume", volume);
     this.emit("state", this.state);
-    if (!same && location.hash.length > 1) this.keepAddress();
+    if (!same && location.hash.length > 1) this.keepAddress(true);
     // The master draws what the hello asked for, or the home view, without being told again.
     if (stale || this.size.join() !== this.toldSize) this.refresh();
   }
@@ -211,6 +213,9 @@ export class Core extends Signals {
    */
   change(patch, tag, moving = false) {
     if (!this.steps) return;
+    // What changes nothing is no step.
+    const now = /** @type {any} */ (this.state);
+    if (Object.entries(patch).every(([k, v]) => v === now[k] || JSON.stringify(v) === JSON.stringify(now[k]))) return;
     const next = { ...this.state, ...patch };
     if (patch.tf && patch.tf !== this.state.tf && !("preset" in patch)) next.preset = null;
     this.steps.push(next, tag, performance.now());
@@ -322,14 +327,17 @@ export class Core extends Signals {
     return film.keys.length ? { ...doc, film } : doc;
   }
 
-  /** Writes the state into the address: an entry of the history at most once a second. */
-  keepAddress() {
+  /**
+   * Writes the state into the address: an entry of the history at most once a second.
+   * @param {boolean} [instead]  in place of the present entry: the state came from it
+   */
+  keepAddress(instead = false) {
     clearTimeout(this.addressTimer);
     this.addressTimer = setTimeout(async () => {
       const hash = await this.address();
       if (!hash || hash === location.hash) return;
       const now = performance.now();
-      if (now - this.addressAt > 1000) history.pushState(null, "", hash);
+      if (!instead && now - this.addressAt > 1000) history.pushState(null, "", hash);
       else history.replaceState(null, "", hash);
       this.addressAt = now;
     }, 400);

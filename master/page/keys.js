@@ -27,7 +27,7 @@ export const KEY_LIST = [
     ["T X V K", "colour, cut, view, save"], ["D J W O", "details, jobs, workers, volumes"],
       ["H", "hide or show the panel"],
     ["I", "values behind the middle"], ["S", "save the picture"], ["C", "copy the link"],
-      ["Z, Shift Z", "undo, redo"], ["Space", "turn by itself"], ["?", "this list"],
+      ["Z, Shift Z", "undo, redo"], ["Space", "turn by itself"], ["Esc", "close what is open"], ["?", "this list"],
   ]],
 ];
 
@@ -50,6 +50,11 @@ const MOVE = 0.05;
 export function listenToKeys(core, acts) {
   addEventListener("keydown", (e) => {
     const target = /** @type {any} */ (e.target);
+    if (e.key === "Escape") {
+      const own = e.defaultPrevented || document.querySelector("dialog[open]") || (target.type === "search" && target.value);
+      if (!own) run(acts, e);
+      return;
+    }
     const typing = target.closest?.("input:not([type=checkbox]):not([type=range]), select, textarea, [contenteditable]");
     if (typing || e.defaultPrevented || document.querySelector("dialog[open]")) return;
     const mod = e.ctrlKey || e.metaKey;

@@ -57,6 +57,12 @@ export function stateWords({ pass, size }, share = 1) {
 const msWords = (ms) => (ms < 9.95 ? ms.toFixed(1) : String(Math.round(ms)));
 
 /**
+ * A time that needs no more room the longer it is.
+ * @param {number} ms
+ */
+export const timeWords = (ms) => (ms < 9999.5 ? `${msWords(ms)} ms` : `${Math.round(ms / 1000)} s`);
+
+/**
  * @param {Core} core
  * @param {any} strip
  */
@@ -85,7 +91,7 @@ export function shownPanel(core, strip) {
     const stale = core.status.state !== "live";
     strip.dataset.state = stale ? "stale" : still ? "still" : "moving";
     setText(parts.state, stale ? "old picture" : stateWords(last));
-    setText(parts.ms, `${msWords(last.ms.total)} ms`);
+    setText(parts.ms, timeWords(last.ms.total));
     setText(parts.level, last.level ? `level ${last.level}` : "full level");
     setText(parts.error, still ? errorWords(last.error) : previewWords(last.bound));
     const known = still && hash && hash.message === last.source;

@@ -11,7 +11,7 @@ import * as state from "../../master/page/state.js";
 import * as tf from "../../master/page/tf.js";
 import { pairOrder, parseTile, waitBeforeDial } from "../../master/page/wire.js";
 import { applyDelta } from "../../master/page/rows.js";
-import { errorWords, previewWords, stateWords } from "../../master/page/shown.js";
+import { errorWords, previewWords, stateWords, timeWords } from "../../master/page/shown.js";
 
 /** @type {[string, () => any][]} */
 const stories = [];
@@ -256,6 +256,16 @@ story("a hundred steps can be undone, and a drag is one", () => {
   same([n, steps.now.n], [100, 51]);
   same(steps.redo(), { n: 52 });
 });
+story("a drag is one step however long it takes, and the next drag is another", () => {
+  const steps = new state.Steps({ n: 0 });
+  let at = 0;
+  for (const hand of [1, 2]) {
+    steps.hold(true);
+    for (let i = 0; i < 3; i++) steps.push({ n: hand * 10 + i }, "hand", at += hand === 1 ? 5000 : 10);
+    steps.hold(false);
+  }
+  same([steps.undo(), steps.undo(), steps.undo()], [{ n: 12 }, { n: 0 }, null]);
+});
 story("a turn has the frames and the step of its length", () => {
   const s = state.homeState(volume);
   const path = state.filmPath({ ...s, film: { ...s.film, degrees: 360, seconds: 2, fps: 30 } }, volume, [64, 64]);
@@ -305,6 +315,7 @@ story("a still says how much of it is there, and is not sharp before it is whole
   const still = { pass: "still", size: [512, 512] };
   same([0, 0.624, 0.9999, 1].map((share) => stateWords(still, share)), ["0 % sharp", "62 % sharp", "99 % sharp", "sharp"]);
   same(stateWords(still), "sharp");
+  same([3.14, 9.97, 1211.3, 9999.4, 9999.6, 30_017].map(timeWords), ["3.1 ms", "10 ms", "1211 ms", "9999 ms", "10 s", "30 s"]);
 });
 story("errors of a still are one sum, or nothing while a part is unknown", () => {
   const [a, b] = [{ value: 0.25, kind: "bound" }, { value: 0.125, kind: "both" }];

@@ -143,9 +143,9 @@ export function shownPanel(core, strip) {
   };
   core.on("state", () => { lateTimer ||= setTimeout(late, LATE_MS); });
   core.on("progress", ({ seq, scene, share }) => {
+    if (core.status.state !== "live" || seq !== core.seq || scene !== core.rev) return;
     clearTimeout(lateTimer);
     lateTimer = 0;
-    if (core.status.state !== "live" || seq !== core.seq || scene !== core.rev) return;
     strip.dataset.state = "moving";
     setText(parts.state, stateWords({ pass: "still", size: [] }, share));
     forget();

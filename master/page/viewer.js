@@ -192,7 +192,7 @@ export class Viewer {
     }
     this.drop(pass);
     if (pass.complete) this.finish(pass);
-    else this.core.emit("progress", { seq: pass.seq, scene: pass.scene, share: pass.share });
+    else if (pass.painted) this.core.emit("progress", { seq: pass.seq, scene: pass.scene, share: pass.share });
   }
 
   /** @param {Pass} pass */

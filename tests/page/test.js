@@ -1,6 +1,7 @@
 /**
  * Tests of the page's pure rooms. In a browser (test.html) results lie in `globalThis.results`:
- * {done, passed, failed: [{name, problem}]}. `node --experimental-default-type=module tests/page/test.js` prints them.
+ * {done, passed, failed: [{name, problem}]}. `deno run tests/page/test.js` prints them, and node does, too:
+ * `node --experimental-default-type=module tests/page/test.js`.
  */
 
 import * as camera from "../../master/page/camera.js";

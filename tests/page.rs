@@ -10,7 +10,7 @@ mod cut_proxy;
 #[path = "support/processes.rs"]
 mod processes;
 
-use chromium::{Chromium, ENTER, Page, RIGHT, Screen, TAB};
+use chromium::{Chromium, ENTER, ESCAPE, Page, RIGHT, Screen, TAB};
 use cut_proxy::CutProxy;
 use processes::{Process, SLABCAST};
 use sha2::{Digest, Sha256};
@@ -322,6 +322,43 @@ fn keys_alone_turn_and_colour() {
     let coloured = rest(&mut page);
     assert_ne!(coloured, turned);
     assert_eq!(pasted(&mut page), coloured);
+    page.end();
+}
+
+#[test]
+fn each_drag_is_a_step_and_escape_closes_what_is_open() {
+    let _alone = alone();
+    let Some(chromium) = Chromium::start() else { return };
+    let (_view, url) = view();
+    let mut page = chromium.open(&url, DESK);
+    let first = rest(&mut page);
+    let steps = "slabcast.core.steps.past.length";
+    turn(&mut page, (30.0, 0.0));
+    turn(&mut page, (30.0, 0.0));
+    assert_eq!(page.number(steps), 3.0, "two drags, however soon the second follows");
+    page.write("11");
+    page.until("slabcast.core.state.cam.azimuth === 0");
+    assert_eq!(page.number(steps), 4.0, "the same side again changes nothing");
+    page.write("zzz");
+    assert_eq!(rest(&mut page), first, "taken back");
+
+    // A drag on empty ground puts a point and moves it, in one step.
+    let points = "slabcast.core.state.tf.opacities.length";
+    let before = page.number(points);
+    let at = page.place(".tf-view", (0.1, 0.0));
+    page.drag(at, (15.0, 20.0));
+    assert_eq!((page.number(points), page.number(steps)), (before + 1.0, 2.0));
+
+    // Values behind a pixel lie over the picture, so they close first.
+    rest(&mut page);
+    page.ask("document.querySelector('#stage').focus()");
+    page.write("i");
+    page.until("!document.querySelector('#picked').hidden");
+    page.key(ESCAPE);
+    assert_eq!(page.ask("document.querySelector('#picked').hidden"), true);
+    assert_eq!(page.ask("document.querySelector('#panel').hidden"), false, "one at a time");
+    page.key(ESCAPE);
+    assert_eq!(page.ask("document.querySelector('#panel').hidden"), true);
     page.end();
 }
 

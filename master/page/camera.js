@@ -404,7 +404,7 @@ export const sidePlain = (side) =>
 export function scaleBar(mmPerPx, most) {
   const largest = mmPerPx * most;
   const power = 10 ** Math.floor(Math.log10(largest));
-  const mm = power * [5, 2, 1].find((k) => k * power <= largest);
+  const mm = power * ([5, 2].find((k) => k * power <= largest) ?? 1);
   return { mm, px: mm / mmPerPx };
 }
 

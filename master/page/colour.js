@@ -12,20 +12,22 @@ import {
   changedStop, emphasised, movedPoint, opacityAt, plainTf, stopHex, windowOf, withLight, withPoint,
   withStop, withWindow, withoutPoint, withoutStop,
 } from "./tf.js";
-import { decodeTile } from "./wire.js";
+import { decodedOrNull } from "./wire.js";
 
 /** @typedef {import("./core.js").Core} Core */
 
 const THUMB_PX = 96;
 /** Presets that are seen before the list is opened: two rows. */
 const FIRST_PRESETS = 8;
+/** @type {Record<string, import("./types.js").Shading["light"]>} */
+const LIGHTS = { key: "key", head: "head", world: [1, 1, 1] };
 
 /**
  * @param {Core} core
  * @param {import("./overlay.js").Overlay} overlay
  */
 export function colourPanel(core, overlay) {
-  const range = () => /** @type {import("./types.js").Volume} */ (core.volume).range;
+  const range = () => core.opened.range;
   const put = (/** @type {any} */ tf, /** @type {string} */ tag) => core.change({ tf }, tag);
 
   // Presets.
@@ -62,7 +64,7 @@ export function colourPanel(core, overlay) {
   core.wire.on("tile", async (t) => {
     const entry = t.thumb && t.seq === thumbId && buttons.get(thumbNames[t.x]);
     if (!entry) return;
-    const bitmap = await decodeTile(t).catch(() => null);
+    const bitmap = await decodedOrNull(t);
     if (!bitmap) return;
     [entry.canvas.width, entry.canvas.height] = [t.w, t.h];
     entry.canvas.getContext("2d").drawImage(bitmap, 0, 0);
@@ -72,14 +74,14 @@ export function colourPanel(core, overlay) {
     buttons.clear();
     grid.replaceChildren();
     maps.replaceChildren();
-    for (const preset of core.volume.presets) {
+    for (const preset of core.opened.presets) {
       if (preset.name.startsWith("peer-")) continue;
       const canvas = h("canvas", { width: THUMB_PX, height: THUMB_PX, "aria-hidden": "true" });
       const button = h("button", {
         type: "button", class: "preset", title: preset.for, "aria-pressed": "false",
         onclick: () => {
           core.change({ tf: plainTf(preset.tf, range()), preset: preset.name }, "");
-          view.zoom = null;
+          view.zoomTo(null);
         },
       }, canvas, h("span", { text: preset.name }));
       buttons.set(preset.name, { button, canvas, drawn: false });
@@ -89,7 +91,7 @@ export function colourPanel(core, overlay) {
   };
 
   // The curve.
-  const view = new TfView(core, () => drawSelected());
+  const view = new TfView(core, () => drawSelected(), () => setAttr(zoomTo, "aria-pressed", String(view.zoom !== null)));
   const scale = segments("Histogram", [["log", "Log"], ["linear", "Linear"]], (v) => {
     view.log = v === "log";
     scale.set(v);
@@ -107,9 +109,7 @@ export function colourPanel(core, overlay) {
     onclick: () => {
       const [a, b] = windowOf(core.state.tf);
       const wide = Math.max(b - a, (range()[1] - range()[0]) / 200) * 1.5;
-      view.zoom = view.zoom ? null : [clamp(a - wide, ...range()), clamp(b + wide, ...range())];
-      setAttr(zoomTo, "aria-pressed", String(view.zoom !== null));
-      view.draw();
+      view.zoomTo(view.zoom ? null : [clamp(a - wide, ...range()), clamp(b + wide, ...range())]);
     },
   });
 
@@ -157,10 +157,16 @@ export function colourPanel(core, overlay) {
   const to = numberField({ label: "To", onchange: (b) => put(withWindow(core.state.tf,
     [Math.min(b, windowOf(core.state.tf)[0]), b], range()), "") });
 
+  const width = numberField({ label: "Width", onchange: (w) => setWindow(levelOf(), Math.max(w, 0)) });
+  const level = numberField({ label: "Level", onchange: (l) => setWindow(l, widthOf()) });
+  const widthOf = () => { const [a, b] = windowOf(core.state.tf); return b - a; };
+  const levelOf = () => { const [a, b] = windowOf(core.state.tf); return (a + b) / 2; };
+  const setWindow = (/** @type {number} */ l, /** @type {number} */ w) =>
+    put(withWindow(core.state.tf, [l - w / 2, l + w / 2], range()), "");
+
   // Light.
   const light = segments("Light", [["key", "Key"], ["head", "Eye"], ["world", "World"], ["off", "Off"]], (v) => {
-    const patch = v === "off" ? { on: false } : { on: true, light: v === "world" ? [1, 1, 1] : v };
-    put(withLight(core.state.tf, patch), "");
+    put(withLight(core.state.tf, v === "off" ? { on: false } : { on: true, light: LIGHTS[v] }), "");
   });
   const lightFields = ["ambient", "diffuse", "specular", "power"].map((name) => {
     const field = numberField({
@@ -172,8 +178,8 @@ export function colourPanel(core, overlay) {
   });
   const direction = ["x", "y", "z"].map((name, i) => numberField({
     label: name, step: 0.1, onchange: (x) => {
-      const now = core.state.tf.shading.light;
-      const next = Array.isArray(now) ? [...now] : [1, 1, 1];
+      const now = core.state.tf.shading?.light;
+      const next = /** @type {import("./types.js").Vec3} */ (Array.isArray(now) ? [...now] : [1, 1, 1]);
       next[i] = x;
       if (next.some((c) => c !== 0)) put(withLight(core.state.tf, { light: next }), "");
       else core.note("warning", "A light needs a direction that is not 0, 0, 0.");
@@ -185,16 +191,17 @@ export function colourPanel(core, overlay) {
   const picked = byId("picked");
   let asked = /** @type {any} */ (null);
   core.on("picking", (p) => { asked = p; });
+  core.on("unpick", () => { picked.hidden = true; overlay.setMark(null); view.showPicked([]); });
   core.wire.on("picked", (m) => {
     if (!asked || m.id !== asked.id) return;
-    overlay.setMark({ x: m.x, y: m.y });
+    overlay.setMark(m);
     if (asked.aim) aimAtPicked(core, m);
     view.showPicked(m.ranges);
     drawPicked(m);
   });
   const drawPicked = (/** @type {any} */ m) => {
     const close = h("button", { type: "button", class: "quiet", "aria-label": "Close",
-      onclick: () => { picked.hidden = true; overlay.setMark(null); view.showPicked([]); } }, icon("close"));
+      onclick: () => core.emit("unpick") }, icon("close"));
     const rows = m.ranges.map((/** @type {any} */ r) => {
       const name = `${numberWords(r.from, 4)} to ${numberWords(r.to, 4)}`;
       const act = (/** @type {number} */ k) => () => put(emphasised(core.state.tf, r.from, r.to, k, range()), "");
@@ -204,7 +211,7 @@ export function colourPanel(core, overlay) {
         h("button", { type: "button", "aria-label": `More of ${name}`, text: "More", onclick: act(1.6) }),
         h("button", { type: "button", "aria-label": `Less of ${name}`, text: "Less", onclick: act(0.4) }));
     });
-    const unit = core.volume.unit;
+    const unit = core.opened.unit;
     picked.replaceChildren(
       h("header", {}, h("h2", { text: `Pixel ${m.x}, ${m.y}` }), close),
       m.hit ? h("p", { text: `Surface at ${m.hit.map((/** @type {number} */ x) => numberWords(x, 4)).join(", ")}${unit && ` ${unit}`}, value ${numberWords(m.value, 4)}` })
@@ -275,7 +282,7 @@ export function colourPanel(core, overlay) {
     put(gradientOn.checked ? { ...rest, gradient_opacity: [[round2(most * 0.05), 0],
       [round2(most * 0.3), 1]] } : rest, "");
   } });
-  const mostGradient = () => core.volume.gradients?.to ?? (range()[1] - range()[0]) / 2 / voxOf(core.volume);
+  const mostGradient = () => core.opened.gradients?.to ?? (range()[1] - range()[0]) / 2 / voxOf(core.opened);
   const border = new BorderView((points, moving) => core.change({ tf: { ...core.state.tf,
     gradient_opacity: points } }, moving ? "tf-border" : "", moving), () => core.settle());
   const round2 = (/** @type {number} */ x) => Number(x.toPrecision(2));
@@ -302,14 +309,14 @@ export function colourPanel(core, overlay) {
       h("div", { class: "row" }, scale.el, axis.el, zoomTo)),
     h("section", {}, h("header", {}, h("h2", { text: "Window" }),
       h("span", { class: "aside", text: "right-drag on the picture" })),
-      h("div", { class: "fields two" }, from.el, to.el)),
+      h("div", { class: "fields two" }, from.el, to.el, width.el, level.el)),
     h("section", {}, h("header", {}, h("h2", { text: "Light" })), light.el,
       directionRow, h("div", { class: "fields two" }, ...lightFields.map((f) => f.el))),
     h("section", {}, h("header", {}, h("h2", { text: "Borders" })), gradient),
     h("section", {}, table));
 
   core.on("volume", () => {
-    view.zoom = null;
+    view.zoomTo(null);
     picked.hidden = true;
     shown = { tf: null, preset: null, cam: null };
     fillPresets();
@@ -327,6 +334,8 @@ export function colourPanel(core, overlay) {
     const [a, b] = windowOf(state.tf);
     from.set(a);
     to.set(b);
+    width.set(Number((b - a).toPrecision(6)));
+    level.set(Number(((a + b) / 2).toPrecision(6)));
     setText(presetName, state.preset ? "" : "changed");
     for (const [name, { button }] of buttons) setAttr(button, "aria-pressed", String(name === state.preset));
     const s = state.tf.shading;
@@ -337,7 +346,7 @@ export function colourPanel(core, overlay) {
     const points = state.tf.gradient_opacity;
     gradientOn.checked = !!points;
     border.el.toggleAttribute("hidden", !points);
-    border.set(points ?? [], mostGradient(), core.volume.gradients);
+    border.set(points ?? [], mostGradient(), core.opened.gradients);
     gradientPoints.forEach((g) => { g.input.disabled = !points; });
     gradientPoints[0].set(points ? points[0][0] : null);
     gradientPoints[1].set(points ? points[points.length - 1][0] : null);

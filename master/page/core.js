@@ -2,7 +2,9 @@
  * What the page knows and what it tells the master. Changes of the state come in by `change`; out go
  * at most one view and one scene a screen frame, and signals for whoever shows something.
  *
- * Signals: `volume`, `state`, `status`, `done`, `painted`, `hash`, `picked`, `note` {level, text}.
+ * Signals: `welcome`, `volume`, `state`, `status`, `painted`, `progress` {seq, scene, share} of a still
+ * that comes tile by tile, `hash`, `picking`, `unpick`, `fitting`, `reset`, `told` (words of a drag),
+ * `note` {level, text}.
  */
 
 import { clamp, keyOfCam } from "./camera.js";
@@ -19,6 +21,16 @@ import { Signals, Wire } from "./wire.js";
 /** After this long without input a view is no longer moving. */
 const SETTLE_MS = 80;
 const TOKEN_KEY = "slabcast-token";
+
+/**
+ * @template T
+ * @param {T|null} x
+ * @returns {T}
+ */
+function present(x) {
+  if (x === null) throw new Error("There is no volume yet.");
+  return x;
+}
 
 export class Core extends Signals {
   constructor() {
@@ -69,9 +81,11 @@ export class Core extends Signals {
     });
   }
 
-  /** @returns {State} */
-  get state() { return /** @type {Steps} */ (this.steps).now; }
-  get axes() { return axesOfState(this.state, /** @type {Volume} */ (this.volume)); }
+  /** The state. Throws before a volume is there, as `opened` does; `steps` is null till then. */
+  get state() { return present(this.steps).now; }
+  /** The volume that is shown. Who may come before there is one asks `volume`, which is null then. */
+  get opened() { return present(this.volume); }
+  get axes() { return axesOfState(this.state, this.opened); }
   get token() { return sessionStorage.getItem(TOKEN_KEY); }
   set token(t) { if (t) sessionStorage.setItem(TOKEN_KEY, t); }
   /** @returns {Record<string, string>} */
@@ -112,6 +126,7 @@ export class Core extends Signals {
     }
     try {
       this.adopt(stateOfDocument(doc, this.volume), "");
+      this.keepAddress(true);
     } catch (e) {
       this.note("warning", /** @type {Error} */ (e).message);
     }
@@ -169,7 +184,7 @@ export class Core extends Signals {
     }
     this.emit("volume", volume);
     this.emit("state", this.state);
-    if (!same && location.hash.length > 1) this.keepAddress();
+    if (!same && location.hash.length > 1) this.keepAddress(true);
     // The master draws what the hello asked for, or the home view, without being told again.
     if (stale || this.size.join() !== this.toldSize) this.refresh();
   }
@@ -198,6 +213,9 @@ export class Core extends Signals {
    */
   change(patch, tag, moving = false) {
     if (!this.steps) return;
+    // What changes nothing is no step.
+    const now = /** @type {any} */ (this.state);
+    if (Object.entries(patch).every(([k, v]) => v === now[k] || JSON.stringify(v) === JSON.stringify(now[k]))) return;
     const next = { ...this.state, ...patch };
     if (patch.tf && patch.tf !== this.state.tf && !("preset" in patch)) next.preset = null;
     this.steps.push(next, tag, performance.now());
@@ -305,18 +323,21 @@ export class Core extends Signals {
   /** The document of the address: a still, and the movie's form. */
   document() {
     const { film } = this.state;
-    const doc = documentOf(this.state, /** @type {Volume} */ (this.volume), this.size);
+    const doc = documentOf(this.state, this.opened, this.size);
     return film.keys.length ? { ...doc, film } : doc;
   }
 
-  /** Writes the state into the address: an entry of the history at most once a second. */
-  keepAddress() {
+  /**
+   * Writes the state into the address: an entry of the history at most once a second.
+   * @param {boolean} [instead]  in place of the present entry: the state came from it
+   */
+  keepAddress(instead = false) {
     clearTimeout(this.addressTimer);
     this.addressTimer = setTimeout(async () => {
       const hash = await this.address();
       if (!hash || hash === location.hash) return;
       const now = performance.now();
-      if (now - this.addressAt > 1000) history.pushState(null, "", hash);
+      if (!instead && now - this.addressAt > 1000) history.pushState(null, "", hash);
       else history.replaceState(null, "", hash);
       this.addressAt = now;
     }, 400);
@@ -328,8 +349,12 @@ export class Core extends Signals {
     const doc = this.document();
     const hash = await fragmentOf(doc);
     if (hash.length <= LONGEST_ADDRESS) return hash;
-    const answer = await this.post("v1/states", doc).catch(() => null);
-    return answer?.ok ? `#s,${(await answer.json()).id}` : null;
+    try {
+      const answer = await this.post("v1/states", doc);
+      return answer.ok ? `#s,${(await answer.json()).id}` : null;
+    } catch {
+      return null;
+    }
   }
 
   /**

@@ -24,7 +24,7 @@ export function cutPanel(core, overlay) {
       const slider = h("input", {
         type: "range", min: 0, max: 1000, step: 1,
         oninput: () => {
-          const [lo, hi] = core.volume.box.map((v) => v[axis]);
+          const [lo, hi] = core.opened.box.map((v) => v[axis]);
           move(axis, /** @type {0|1} */ (side), lo + (Number(slider.value) / 1000) * (hi - lo), true);
         },
         onchange: () => core.settle(),
@@ -44,7 +44,7 @@ export function cutPanel(core, overlay) {
    * @param {boolean} moving
    */
   const move = (axis, side, x, moving) =>
-    core.change({ crop: cropWith(core.state.crop, axis, side, x, core.volume.box) }, `crop${axis}${side}`, moving);
+    core.change({ crop: cropWith(core.state.crop, axis, side, x, core.opened.box) }, `crop${axis}${side}`, moving);
   const show = h("input", { type: "checkbox", checked: true, onchange: () => overlay.setBox(show.checked) });
   const reset = h("button", { type: "button", text: "Whole volume",
     onclick: () => core.change({ crop: noCrop() }, "") });

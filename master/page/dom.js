@@ -87,7 +87,7 @@ export const numberWords = (x, digits = 6) => String(Number(x.toPrecision(digits
 
 /**
  * A labelled number that can be typed and stepped. Changes are told when they are complete; what is no
- * number, or beyond the limits, is put back.
+ * number, or beyond the limits, is put back, and Escape puts back what was typed.
  * @param {{label: string, unit?: string, min?: number, max?: number, step?: number, hidden?: boolean,
  *   onchange: (x: number) => void}} options
  * @returns {{el: HTMLElement, set: (x: number|null) => void, unit: (word: string) => void,
@@ -103,10 +103,15 @@ export function numberField({ label, unit = "", min, max, step = 1, hidden = fal
     const x = Number(input.value);
     const inside = input.value !== "" && Number.isFinite(x) && (min == null || x >= min) && (max == null || x <= max);
     if (inside && input.value !== shown) onchange(x);
-    else input.value = shown;
+    // The value that holds now: another one where it had to be put between limits.
+    if (input.value !== shown) input.value = shown;
   };
   input.addEventListener("change", take);
   input.addEventListener("keydown", (/** @type {KeyboardEvent} */ e) => {
+    if (e.key === "Escape" && input.value !== shown) {
+      input.value = shown;
+      e.preventDefault();
+    }
     const sign = e.key === "ArrowUp" ? 1 : e.key === "ArrowDown" ? -1 : 0;
     if (!sign) return;
     e.preventDefault();

@@ -7,9 +7,19 @@
  */
 
 import { aimedAt, clamp, pannedBy, rolledBy, turnedBy, zoomedAt } from "./camera.js";
+import { numberWords } from "./dom.js";
 import { fadedBy, windowOf, withWindow } from "./tf.js";
 
 /** @typedef {import("./core.js").Core} Core */
+
+/**
+ * The window in words, as on the screens of radiologists.
+ * @param {import("./types.js").Tf} tf
+ */
+export function windowWords(tf) {
+  const [a, b] = windowOf(tf);
+  return `W ${numberWords(b - a, 4)}  L ${numberWords((a + b) / 2, 4)}`;
+}
 
 /** A press that moved less than this many pixels is a click. */
 const CLICK_PX = 4;
@@ -61,7 +71,7 @@ export function listenToHands(stage, core) {
   const zoom = (factor, x, y, cam) => {
     const b = box();
     return zoomedAt(cam, core.axes, factor, x - b.left - b.width / 2, y - b.top - b.height / 2, b.height,
-      heightLimits(/** @type {any} */ (core.volume)));
+      heightLimits(core.opened));
   };
 
   stage.addEventListener("pointerdown", (/** @type {PointerEvent} */ e) => {
@@ -121,15 +131,20 @@ export function listenToHands(stage, core) {
     if (gesture.kind === "turn") core.change({ cam: turnedBy(cam, o, dx, dy, height) }, "hand", true);
     if (gesture.kind === "pan") core.change({ cam: pannedBy(cam, o, dx, dy, height) }, "hand", true);
     const [alongX, alongY] = [(e.clientX - gesture.x0) / height, (e.clientY - gesture.y0) / height];
-    if (gesture.kind === "opacity") core.change({ tf: fadedBy(gesture.tf, 10 ** (-2 * alongY)) }, "hand-tf", true);
+    if (gesture.kind === "opacity") {
+      const factor = 10 ** (-2 * alongY);
+      core.change({ tf: fadedBy(gesture.tf, factor) }, "hand-tf", true);
+      core.emit("told", `opacity × ${numberWords(factor, 2)}`);
+    }
     if (gesture.kind === "window") {
-      const range = /** @type {import("./types.js").Volume} */ (core.volume).core;
+      const range = core.opened.core;
       const [a, b] = windowOf(gesture.tf);
       const span = range[1] - range[0];
       const level = (a + b) / 2 + alongX * span * 0.5;
       const width = clamp((b - a || span / 100) * 4 ** (2 * alongY), span / 1000, 2 * span);
-      core.change({ tf: withWindow(gesture.tf, [level - width / 2, level + width / 2], core.volume.range) },
+      core.change({ tf: withWindow(gesture.tf, [level - width / 2, level + width / 2], core.opened.range) },
         "hand-tf", true);
+      core.emit("told", windowWords(core.state.tf));
     }
   });
 

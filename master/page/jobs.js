@@ -3,7 +3,7 @@
 import { refusalWords } from "./core.js";
 import { bytesWords, download, durationWords, h, icon, setAttr, setText } from "./dom.js";
 import { Rows, applyDelta } from "./rows.js";
-import { decodeTile } from "./wire.js";
+import { decodedOrNull } from "./wire.js";
 
 /** @typedef {import("./core.js").Core} Core */
 
@@ -37,7 +37,7 @@ export function jobsPanel(core, announce) {
   let total = 0;
   const now = () => Date.now() + core.clockOffset;
   const rows = new Rows({
-    label: "Jobs", rem: 4.6, empty: "No job yet. A movie that you make here, and what slabcast render --master sends, appears in this list.",
+    label: "Jobs", rem: 4.8, empty: "No job yet. A movie that you make here, and what slabcast render --master sends, appears in this list.",
     make: () => {
       const row = /** @type {any} */ ({ job: null });
       row.canvas = h("canvas", { width: 48, height: 48, "aria-hidden": "true" });
@@ -69,7 +69,9 @@ export function jobsPanel(core, announce) {
       setText(row.count, `${job.frames_done} / ${job.frames_total}`);
       row.bar.value = job.frames_total ? job.frames_done / job.frames_total : 0;
       setAttr(row.bar, "aria-label", `Progress of ${job.job}`);
-      setText(row.words, [jobWords(job, now()), `${job.volume}, ${job.size.join("×")}`].filter(Boolean).join(" · "));
+      const failed = job.state === "failed";
+      setText(row.words, [jobWords(job, now()), failed ? "" : `${job.volume}, ${job.size.join("×")}`].filter(Boolean).join(" · "));
+      row.words.classList.toggle("why", failed);
       setAttr(row.words, "title", row.words.textContent);
       row.cancel.hidden = !OPEN.includes(job.state);
       setAttr(row.cancel, "aria-label", `Cancel ${job.job}`);
@@ -120,7 +122,7 @@ export function jobsPanel(core, announce) {
   core.wire.on("tile", async (t) => {
     if (!t.thumb || t.seq !== thumbId) return;
     const name = names[t.x];
-    const bitmap = await decodeTile(t).catch(() => null);
+    const bitmap = await decodedOrNull(t);
     if (!bitmap || !name) return;
     pictures.set(name, bitmap);
     if (pictures.size > 400) {

@@ -27,7 +27,7 @@ export const KEY_LIST = [
     ["T X V K", "colour, cut, view, save"], ["D J W O", "details, jobs, workers, volumes"],
       ["H", "hide or show the panel"],
     ["I", "values behind the middle"], ["S", "save the picture"], ["C", "copy the link"],
-      ["Z, Shift Z", "undo, redo"], ["Space", "turn by itself"], ["?", "this list"],
+      ["Z, Shift Z", "undo, redo"], ["Space", "turn by itself"], ["Esc", "close what is open"], ["?", "this list"],
   ]],
 ];
 
@@ -50,6 +50,11 @@ const MOVE = 0.05;
 export function listenToKeys(core, acts) {
   addEventListener("keydown", (e) => {
     const target = /** @type {any} */ (e.target);
+    if (e.key === "Escape") {
+      const own = e.defaultPrevented || document.querySelector("dialog[open]") || (target.type === "search" && target.value);
+      if (!own) run(acts, e);
+      return;
+    }
     const typing = target.closest?.("input:not([type=checkbox]):not([type=range]), select, textarea, [contenteditable]");
     if (typing || e.defaultPrevented || document.querySelector("dialog[open]")) return;
     const mod = e.ctrlKey || e.metaKey;
@@ -99,9 +104,9 @@ function cameraKey(core, e) {
     return put(steppedBy(cam, o, by[0] * step, by[1] * step), "key-turn");
   }
   if (e.altKey) return false;
-  if (e.key === "+" || e.key === "=") return put(zoomedAt(cam, o, 1 / 1.2, 0, 0, 1, heightLimits(core.volume)),
+  if (e.key === "+" || e.key === "=") return put(zoomedAt(cam, o, 1 / 1.2, 0, 0, 1, heightLimits(core.opened)),
     "key-zoom");
-  if (e.key === "-") return put(zoomedAt(cam, o, 1.2, 0, 0, 1, heightLimits(core.volume)), "key-zoom");
+  if (e.key === "-") return put(zoomedAt(cam, o, 1.2, 0, 0, 1, heightLimits(core.opened)), "key-zoom");
   if (e.key === "[") return put(rolledBy(cam, -TURN), "key-lean");
   if (e.key === "]") return put(rolledBy(cam, TURN), "key-lean");
   if (/^[1-6]$/.test(e.key)) {

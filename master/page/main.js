@@ -61,6 +61,7 @@ function openTab(name, toggle = true) {
   }
   byId("panel").hidden = next === "";
   document.body.classList.toggle("closed", next === "");
+  if (next) byId(`tab-${next}`).scrollIntoView({ block: "nearest", inline: "nearest" });
   core.watch(NEWS.includes(next) ? [next] : []);
   panels[next]?.shown?.();
 }
@@ -114,17 +115,18 @@ for (const name of OF_PICTURE) byId(`panel-${name}`).inert = true;
 core.wire.on("welcome", (m) => {
   if (!m.empty) return;
   openTab("volumes", false);
-  core.note("info", "This master has no volume yet. Drop a file on the page, or use slabcast put.");
+  byId("empty").hidden = false;
 });
 core.on("volume", (volume) => {
+  byId("empty").hidden = true;
   for (const name of OF_PICTURE) byId(`panel-${name}`).inert = false;
   setText(byId("volume-name"), volume.name);
   setText(byId("volume-shape"), `${volume.dims.join(" × ")} ${volume.sample_kind}`);
   document.title = `${volume.name} – slabcast`;
 });
 core.on("state", (state) => {
-  setAttr(byId("undo"), "disabled", core.steps.past.length < 2);
-  setAttr(byId("redo"), "disabled", core.steps.future.length < 1);
+  setAttr(byId("undo"), "disabled", !core.steps?.canUndo);
+  setAttr(byId("redo"), "disabled", !core.steps?.canRedo);
   stage.style.background = state.background;
 });
 /** @type {any} */
@@ -135,14 +137,14 @@ core.on("painted", (m) => {
   // A screen reader is told when the view rests, not at each step of a turn.
   clearTimeout(labelTimer);
   labelTimer = setTimeout(() => {
-    const { state, volume } = core;
+    const { state, opened: volume } = core;
     const look = state.preset ?? "own colours";
     const where = `${look}, ${camWords(state.cam, core.axes, volume.anatomical)}, ${m.pass === "still" ? "sharp" : "moving"}`;
     setAttr(viewer.still, "aria-label", `${volume.name}, ${where}`);
     if (document.activeElement === stage && m.pass === "still") announce(where);
   }, 250);
 });
-core.on("reset", () => core.adopt({ ...core.state, cam: homeState(core.volume).cam }, ""));
+core.on("reset", () => core.adopt({ ...core.state, cam: homeState(core.opened).cam }, ""));
 
 // Turning by itself; never for who asked for less motion.
 let spin = 0;
@@ -165,6 +167,10 @@ function toggleSpin() {
 }
 stage.addEventListener("pointerdown", () => { if (spin) toggleSpin(); });
 
+// A press is one step to undo, however long it takes.
+addEventListener("pointerdown", () => core.steps?.hold(true), true);
+for (const end of ["pointerup", "pointercancel"]) addEventListener(end, () => core.steps?.hold(false));
+
 // Theme: the system's, or the other one.
 const THEME = "slabcast-theme";
 const setTheme = (/** @type {string|null} */ theme) => setAttr(document.documentElement, "data-theme", theme);
@@ -174,6 +180,19 @@ byId("theme").addEventListener("click", () => {
   localStorage.setItem(THEME, dark);
   setTheme(dark);
 });
+
+/** Closes what lies over the picture, else the panel. The focus goes to where it was opened. */
+function closeUppermost() {
+  if (!byId("picked").hidden) {
+    core.emit("unpick");
+    stage.focus();
+  } else if (open) {
+    const inside = byId("panel").contains(document.activeElement);
+    const tab = byId(`tab-${open}`);
+    openTab("");
+    if (inside) tab.focus();
+  }
+}
 
 const help = byId("help");
 fillHelp(help);
@@ -191,6 +210,7 @@ listenToKeys(core, {
   s: () => { savePicture(core, core.size, "png", false); }, c: () => { copyAddress(core); },
   z: () => core.step("undo"), "z+shift": () => core.step("redo"),
     i: () => pickAt(core, core.size[0] >> 1, core.size[1] >> 1, false), Space: toggleSpin, "?": showHelp,
+  escape: closeUppermost,
 });
 let lastOpen = "colour";
 tablist.addEventListener("click", () => { if (open) lastOpen = open; });

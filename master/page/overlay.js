@@ -1,6 +1,6 @@
 /**
  * What lies over the picture: letters at its edges, a cube that shows how the volume stands, a scale
- * bar, the crop box with a handle on each face, and the mark of a picked pixel.
+ * bar, the crop box with a handle on each face, the mark of a picked pixel, and numbers of a drag.
  */
 
 import {
@@ -14,6 +14,8 @@ import { setAttr, svg, uiScale } from "./dom.js";
 /** @typedef {import("./types.js").Vec3} Vec3 */
 
 const CUBE = 30;
+/** So long numbers of a drag stay on the picture. */
+const TOLD_MS = 1500;
 
 export class Overlay {
   /**
@@ -39,8 +41,16 @@ export class Overlay {
     this.faces = [0, 1, 2].flatMap((axis) => [0, 1].map((side) => this.face(axis, /** @type {0|1} */ (side))));
     this.box = svg("g", { class: "crop-box" }, this.back, this.edges, ...this.faces.map((f) => f.el));
     this.cross = svg("path", { class: "mark", d: "M-9 0h6M3 0h6M0-9v6M0 3v6" });
-    root.append(this.box, ...Object.values(this.letters), this.bar, this.barText, this.cube, this.cross);
+    this.told = svg("text", { class: "told" });
+    root.append(this.box, ...Object.values(this.letters), this.bar, this.barText, this.cube, this.cross, this.told);
     core.on("state", () => this.draw());
+    /** @type {any} */
+    let timer = 0;
+    core.on("told", (text) => {
+      this.told.textContent = text;
+      clearTimeout(timer);
+      timer = setTimeout(() => { this.told.textContent = ""; }, TOLD_MS);
+    });
     core.on("volume", () => { this.mark = null; this.draw(); });
     new ResizeObserver(() => this.draw()).observe(stage);
   }
@@ -57,7 +67,7 @@ export class Overlay {
     el.addEventListener("pointerdown", (/** @type {PointerEvent} */ e) => {
       e.stopPropagation();
       el.setPointerCapture(e.pointerId);
-      const { volume, state } = this.core;
+      const { opened: volume, state } = this.core;
       const ends = cropBox(state.crop, volume.box);
       const at = faceMiddle(ends, axis, side);
       const step = /** @type {Vec3} */ (at.map((x, i) => x + (i === axis ? 1 : 0)));
@@ -68,7 +78,7 @@ export class Overlay {
     });
     el.addEventListener("pointermove", (/** @type {PointerEvent} */ e) => {
       if (!drag) return;
-      const { volume, state } = this.core;
+      const { opened: volume, state } = this.core;
       const pxPerMm = this.rect().height / state.cam.height;
       const by = dragAlong(e.clientX - drag.x, e.clientY - drag.y, drag.ax, drag.ay, pxPerMm);
       this.core.change({ crop: cropWith(state.crop, axis, side, drag.from + by, volume.box) }, `crop${axis}${side}`,
@@ -97,11 +107,11 @@ export class Overlay {
   }
 
   /**
-   * Marks a pixel of the picture, or none.
-   * @param {{x: number, y: number}|null} at
+   * Marks a picked pixel, or none. The mark stays on the surface that was hit, however the picture turns.
+   * @param {{x: number, y: number, hit: Vec3|null}|null} picked
    */
-  setMark(at) {
-    this.mark = at;
+  setMark(picked) {
+    this.mark = picked && { ...picked, cam: this.core.state.cam };
     this.draw();
   }
 
@@ -115,6 +125,7 @@ export class Overlay {
 
   drawNow() {
     const { core, root } = this;
+    setAttr(root, "display", core.volume ? null : "none");
     if (!core.volume || !core.steps) return;
     const { width, height } = this.rect();
     if (width < 2) return;
@@ -131,14 +142,26 @@ export class Overlay {
       setAttr(el, "x", x);
       setAttr(el, "y", y);
     }
+    setAttr(this.told, "x", width - 12 * k);
+    setAttr(this.told, "y", 18 * k);
     this.drawBar(width, height);
     this.drawCube(height);
     this.drawBox();
-    setAttr(this.cross, "display", this.mark ? null : "none");
-    if (this.mark) {
-      const [x, y] = [(this.mark.x + 0.5) * (width / core.size[0]), (this.mark.y + 0.5) * (height / core.size[1])];
-      setAttr(this.cross, "transform", `translate(${x} ${y})`);
-    }
+    const at = this.markPlace(width, height);
+    setAttr(this.cross, "display", at ? null : "none");
+    if (at) setAttr(this.cross, "transform", `translate(${at[0].toFixed(1)} ${at[1].toFixed(1)})`);
+  }
+
+  /**
+   * Where the mark is, or null: where nothing was hit it goes with the view.
+   * @param {number} width
+   * @param {number} height
+   */
+  markPlace(width, height) {
+    const { mark, core } = this;
+    if (mark?.hit) return this.project()(mark.hit);
+    if (!mark || mark.cam !== core.state.cam) return null;
+    return [(mark.x + 0.5) * (width / core.size[0]), (mark.y + 0.5) * (height / core.size[1])];
   }
 
   /**
@@ -146,7 +169,7 @@ export class Overlay {
    * @param {number} height
    */
   drawBar(width, height) {
-    const { state, volume } = this.core;
+    const { state, opened: volume } = this.core;
     const k = uiScale();
     const { mm, px } = scaleBar(state.cam.height / height, Math.min(160 * k, width / 4));
     const [x, y] = [width - 16 * k - px, height - 14 * k];
@@ -158,7 +181,7 @@ export class Overlay {
 
   /** @param {number} height */
   drawCube(height) {
-    const { state, axes, volume } = this.core;
+    const { state, axes, opened: volume } = this.core;
     const { right, down, ahead } = eyeAxes(state.cam, axes);
     const letters = axisLetters(volume.anatomical);
     const k = uiScale();
@@ -213,7 +236,7 @@ export class Overlay {
     const { core } = this;
     setAttr(this.box, "display", this.showBox ? null : "none");
     if (!this.showBox) return;
-    const { volume, state, axes } = core;
+    const { opened: volume, state, axes } = core;
     const ends = cropBox(state.crop, volume.box);
     const project = this.project();
     const { ahead } = eyeAxes(state.cam, axes);

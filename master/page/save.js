@@ -25,7 +25,7 @@ const fileName = (core, end) => `${core.state.volume.replace(/\.(nii|nrrd|mha|mh
  * @param {boolean} transparent
  */
 export async function savePicture(core, size, format, transparent) {
-  const doc = { ...documentOf(core.state, core.volume, size), format };
+  const doc = { ...documentOf(core.state, core.opened, size), format };
   if (transparent) doc.background = "transparent";
   try {
     const answer = await core.post("v1/picture", doc);
@@ -78,7 +78,7 @@ export function savePanel(core) {
   const frames = h("span", { class: "aside" });
   const make = h("button", { type: "button", class: "primary", text: "Make movie" });
   make.addEventListener("click", busy(make, async () => {
-    const doc = { ...documentOf(core.state, core.volume, size()), path: filmPath(core.state, core.volume, size()),
+    const doc = { ...documentOf(core.state, core.opened, size()), path: filmPath(core.state, core.opened, size()),
       fps: core.state.film.fps, format: core.state.film.format };
     try {
       const answer = await core.post("v1/movie", doc);
@@ -112,7 +112,7 @@ export function savePanel(core) {
     load.value = "";
     if (!file) return;
     try {
-      core.change({ tf: readTf(await file.text(), core.volume.range, voxOf(core.volume)) }, "");
+      core.change({ tf: readTf(await file.text(), core.opened.range, voxOf(core.opened)) }, "");
       core.note("info", `${file.name} colours the picture.`);
     } catch (e) { core.note("error", /** @type {Error} */ (e).message); }
   });
@@ -122,10 +122,10 @@ export function savePanel(core) {
     h("button", { type: "button", text: "For ParaView",
       onclick: () => downloadJson(paraviewOf(core.state.tf, `slabcast ${core.state.preset ?? core.state.volume}`),
       fileName(core, "-paraview.json")) }),
-    h("button", { type: "button", text: "View", onclick: () => downloadJson(stillPath(core.state, core.volume,
+    h("button", { type: "button", text: "View", onclick: () => downloadJson(stillPath(core.state, core.opened,
       size()), fileName(core, "-view.json")) }),
     h("button", { type: "button", text: "Movie path",
-      onclick: () => downloadJson(filmPath(core.state, core.volume, size()), fileName(core, "-path.json")) }),
+      onclick: () => downloadJson(filmPath(core.state, core.opened, size()), fileName(core, "-path.json")) }),
     h("button", { type: "button", text: "Load colours…", onclick: () => load.click() }), load);
 
   const el = h("div", {},
@@ -146,7 +146,7 @@ export function savePanel(core) {
     if (text === keysShown) return;
     keysShown = text;
     keys.replaceChildren(...f.keys.map((stop, i) => h("li", {},
-      h("span", { text: `${i + 1}. ${camWords(stop.cam, core.axes, core.volume.anatomical)}, ${typeof stop.tf === "string" ? stop.tf : "own colours"}` }),
+      h("span", { text: `${i + 1}. ${camWords(stop.cam, core.axes, core.opened.anatomical)}, ${typeof stop.tf === "string" ? stop.tf : "own colours"}` }),
       h("button", { type: "button", text: "Show", "aria-label": `Show key ${i + 1}`,
         onclick: () => core.change({ cam: stop.cam }, "") }),
       h("button", { type: "button", text: "Set", "aria-label": `Set key ${i + 1} to this view`,
@@ -175,9 +175,9 @@ export function savePanel(core) {
     drawKeys();
     shown.set(words);
     const base = location.href.replace(/[#?].*$/, "").replace(/[^/]*$/, "");
-    setText(code, words === "python" ? pythonLines(documentOf(core.state, core.volume, size()), base, !!core.token)
-      : pasteable(words === "film" ? filmCommand(core.state, core.volume, size()) : stillCommand(core.state,
-        core.volume, size())));
+    setText(code, words === "python" ? pythonLines(documentOf(core.state, core.opened, size()), base, !!core.token)
+      : pasteable(words === "film" ? filmCommand(core.state, core.opened, size()) : stillCommand(core.state,
+        core.opened, size())));
   }
   core.on("welcome", (m) => {
     const names = m.movies.length ? m.movies : ["zip"];

@@ -57,7 +57,7 @@ export function sha256Plain(bytes) {
 }
 
 /**
- * @param {Uint8Array|Uint8ClampedArray} bytes
+ * @param {Uint8Array<ArrayBuffer>|Uint8ClampedArray<ArrayBuffer>} bytes
  * @returns {Promise<string>}
  */
 export async function sha256(bytes) {

@@ -29,10 +29,38 @@ export function errorWords(error) {
  * @param {number} off  in 1/255
  * @param {boolean} bound  it cannot be more
  */
-const offWords = (off, bound) => `off ${bound ? "≤" : "≈"} ${off < 9.95 ? off.toFixed(1) : Math.round(off)}/255`;
+const offWords = (off, bound) => `${bound ? "at most" : "about"} ${off < 9.95 ? off.toFixed(1) : Math.round(off)}/255 off`;
+
+/**
+ * How far a preview is off the still that follows, in words; nothing while nobody knows. It is an
+ * estimate, so one digit of it says enough.
+ * @param {number} bound  root mean square, share of full scale; NaN: unknown
+ */
+export function previewWords(bound) {
+  const off = bound * 255;
+  if (!Number.isFinite(off)) return "";
+  if (off < 0.05) return "under 0.1/255 off";
+  return `about ${off < 9.5 ? Number(off.toPrecision(1)) : Math.round(off)}/255 off`;
+}
+
+/**
+ * What is on the screen, in words.
+ * @param {{pass: string, size: number[]}} picture
+ * @param {number} share  of a still that is there
+ */
+export function stateWords({ pass, size }, share = 1) {
+  if (share < 1) return `${Math.floor(share * 100)} % sharp`;
+  return pass === "still" ? "sharp" : `preview ${size.join("×")}`;
+}
 
 /** @param {number} ms */
 const msWords = (ms) => (ms < 9.95 ? ms.toFixed(1) : String(Math.round(ms)));
+
+/**
+ * A time that needs no more room the longer it is.
+ * @param {number} ms
+ */
+export const timeWords = (ms) => (ms < 9999.5 ? `${msWords(ms)} ms` : `${Math.round(ms / 1000)} s`);
 
 /**
  * @param {Core} core
@@ -62,17 +90,17 @@ export function shownPanel(core, strip) {
     const still = last.pass === "still";
     const stale = core.status.state !== "live";
     strip.dataset.state = stale ? "stale" : still ? "still" : "moving";
-    setText(parts.state, stale ? "old picture" : still ? "sharp" : "moving");
-    setText(parts.ms, `${msWords(last.ms.total)} ms`);
+    setText(parts.state, stale ? "old picture" : stateWords(last));
+    setText(parts.ms, timeWords(last.ms.total));
     setText(parts.level, last.level ? `level ${last.level}` : "full level");
-    const off = last.bound * 255;
-    setText(parts.error, still ? errorWords(last.error) : Number.isNaN(off) ? "" : offWords(off, true));
+    setText(parts.error, still ? errorWords(last.error) : previewWords(last.bound));
     const known = still && hash && hash.message === last.source;
     setText(parts.hash, known ? `${hash.hex.slice(0, 8)} ${hash.same ? "=" : "≠"} file` : "");
     setAttr(parts.hash, "data-same", known ? String(hash.same) : null);
     if (!el.isConnected || el.closest("[hidden]")) return;
     const rows = [
       ["Pass", still ? "still: the pixels of the file" : "moving: a preview"],
+      ...(still ? [] : [["Off the still", previewWords(last.bound) || "not known yet"]]),
       ["Size", last.size.join(" × ")],
       ["Time", `${msWords(last.ms.total)} ms: ${msWords(last.ms.draw)} drawing, ${msWords(last.ms.encode)} encoding, ${msWords(last.ms.wait)} waiting`],
       ["Level", String(last.level)],
@@ -98,6 +126,11 @@ export function shownPanel(core, strip) {
         x.saved_bytes && bytesWords(x.saved_bytes)].filter(Boolean).join(", ") })))
       : [h("li", { text: "Nothing." })]));
   };
+  /** Takes away what was said of a still that is not the latest. */
+  const forget = () => {
+    setText(parts.hash, "");
+    if (last?.pass === "still") setText(parts.error, "");
+  };
   /** @type {any} */
   let lateTimer = 0;
   /** Says so if what is on the screen is still not what was asked for. */
@@ -106,9 +139,17 @@ export function shownPanel(core, strip) {
     if (!last || core.status.state !== "live" || (last.seq === core.seq && last.scene === core.rev)) return;
     strip.dataset.state = "moving";
     setText(parts.state, "drawing");
-    setText(parts.hash, "");
+    forget();
   };
   core.on("state", () => { lateTimer ||= setTimeout(late, LATE_MS); });
+  core.on("progress", ({ seq, scene, share }) => {
+    if (core.status.state !== "live" || seq !== core.seq || scene !== core.rev) return;
+    clearTimeout(lateTimer);
+    lateTimer = 0;
+    strip.dataset.state = "moving";
+    setText(parts.state, stateWords({ pass: "still", size: [] }, share));
+    forget();
+  });
   core.on("painted", (m) => { last = { ...m, source: core.done }; draw(); });
   core.on("hash", (x) => { hash = x; draw(); });
   core.on("status", draw);

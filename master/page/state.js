@@ -171,7 +171,7 @@ export function bytesOfBase64url(text) {
 }
 
 /**
- * @param {Uint8Array} bytes
+ * @param {Uint8Array<ArrayBuffer>} bytes
  * @param {any} through
  */
 async function piped(bytes, through) {
@@ -198,7 +198,10 @@ export async function documentOfFragment(hash) {
   return JSON.parse(new TextDecoder().decode(bytes));
 }
 
-/** Steps that can be undone: at most 100. A drag is one step: changes of one tag within a second merge. */
+/**
+ * Steps that can be undone: at most 100. Changes of one tag merge into one step while a hand is down, and
+ * within a second otherwise (keys, the wheel).
+ */
 export class Steps {
   /** @param {State} first */
   constructor(first) {
@@ -208,9 +211,12 @@ export class Steps {
     this.future = [];
     this.tag = "";
     this.at = -Infinity;
+    this.held = false;
   }
 
   get now() { return this.past[this.past.length - 1]; }
+  get canUndo() { return this.past.length > 1; }
+  get canRedo() { return this.future.length > 0; }
 
   /**
    * @param {State} state
@@ -218,13 +224,22 @@ export class Steps {
    * @param {number} at  milliseconds
    */
   push(state, tag, at) {
-    const merge = tag !== "" && tag === this.tag && at - this.at < 1000 && this.past.length > 1;
+    const merge = tag !== "" && tag === this.tag && (this.held || at - this.at < 1000) && this.past.length > 1;
     if (merge) this.past[this.past.length - 1] = state;
     else this.past.push(state);
     if (this.past.length > 101) this.past.shift();
     this.future = [];
     this.tag = tag;
     this.at = at;
+  }
+
+  /**
+   * A hand is put on something, or taken off it: what follows is another step.
+   * @param {boolean} held
+   */
+  hold(held) {
+    this.held = held;
+    this.tag = "";
   }
 
   /**
@@ -235,7 +250,7 @@ export class Steps {
 
   /** @returns {State|null} */
   undo() {
-    if (this.past.length < 2) return null;
+    if (!this.canUndo) return null;
     this.future.push(/** @type {State} */ (this.past.pop()));
     this.tag = "";
     return this.now;

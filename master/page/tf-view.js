@@ -22,10 +22,12 @@ export class TfView {
   /**
    * @param {Core} core
    * @param {(selected: {kind: "point"|"stop", index: number}) => void} onselect
+   * @param {() => void} onzoom
    */
-  constructor(core, onselect) {
+  constructor(core, onselect, onzoom) {
     this.core = core;
     this.onselect = onselect;
+    this.onzoom = onzoom;
     this.log = true;
     this.stretched = true;
     /** @type {[number, number]|null} shown part of the range; null: all that matters */
@@ -38,6 +40,7 @@ export class TfView {
     this.gradient = svg("linearGradient", { id: gradient });
     this.clip = svg("rect", {});
     this.bars = svg("path", { class: "bars" });
+    this.outline = svg("path", { class: "outline" });
     this.area = svg("path", { class: "area", fill: `url(#${gradient})` });
     this.curve = svg("path", { class: "curve" });
     this.grid = svg("g", { class: "grid" });
@@ -53,7 +56,7 @@ export class TfView {
     },
     svg("defs", {}, this.gradient, svg("clipPath", { id: clip }, this.clip)),
     this.ground, this.grid,
-    svg("g", { "clip-path": `url(#${clip})` }, this.bars, this.area, this.picked, this.curve),
+    svg("g", { "clip-path": `url(#${clip})` }, this.bars, this.area, this.outline, this.picked, this.curve),
     this.window, this.strip, this.stops, this.points);
     this.listen();
     new ResizeObserver(([entry]) => {
@@ -69,10 +72,17 @@ export class TfView {
 
   /** @returns {[number, number]} values at the left and right end */
   get span() {
-    const { range, core } = /** @type {import("./types.js").Volume} */ (this.core.volume);
+    const { range, core } = this.core.opened;
     if (this.zoom) return this.zoom;
     const [a, b] = [Math.min(range[0], core[0]), core[1]];
     return b > a ? [a, b] : [range[0], range[0] + 1];
+  }
+
+  /** @param {[number, number]|null} span  null: all that matters */
+  zoomTo(span) {
+    this.zoom = span;
+    this.onzoom();
+    this.draw();
   }
 
   /** @param {number} x value */
@@ -97,7 +107,7 @@ export class TfView {
     };
   }
 
-  get range() { return /** @type {import("./types.js").Volume} */ (this.core.volume).range; }
+  get range() { return this.core.opened.range; }
   get tf() { return this.core.state.tf; }
 
   /**
@@ -152,7 +162,7 @@ export class TfView {
           const [tf, made] = withPoint(this.tf, at.x, at.a, this.range);
           Object.assign(drag, { kind: "point", index: made, tf });
           this.selected = { kind: "point", index: made };
-          this.put(tf, "", true);
+          this.put(tf, "tf-point", true);
           last.kind = "point";
           this.onselect(this.selected);
         } else drag.kind = "whole";
@@ -198,14 +208,16 @@ export class TfView {
       this.removeAt(e);
     });
     this.el.addEventListener("wheel", (/** @type {WheelEvent} */ e) => {
-      e.preventDefault();
+      if (!this.core.volume) return;
       const { x } = this.at(e);
       const [a, b] = this.span;
       const k = Math.exp(clamp(e.deltaY, -200, 200) * 0.002);
       const full = this.range;
       const [lo, hi] = [Math.max(x - (x - a) * k, full[0]), Math.min(x + (b - x) * k, full[1])];
-      if (hi - lo > (full[1] - full[0]) / 1000) this.zoom = hi - lo >= (full[1] - full[0]) * 0.999 ? null : [lo, hi];
-      this.draw();
+      // With all in sight there is nothing to zoom out of, and the wheel scrolls the panel.
+      if (lo === a && hi === b) return;
+      e.preventDefault();
+      if (hi - lo > (full[1] - full[0]) / 1000) this.zoomTo([lo, hi]);
     }, { passive: false });
     this.el.addEventListener("keydown", (/** @type {KeyboardEvent} */ e) => this.key(e));
   }
@@ -318,12 +330,12 @@ export class TfView {
   drawBars({ from, to, counts }) {
     const heights = barHeights(counts, this.log);
     const width = (to - from) / counts.length || 1;
-    let d = `M${this.px(from).toFixed(1)} ${this.bottom}`;
-    heights.forEach((y, i) => {
+    const tops = heights.map((y, i) => {
       const top = (this.bottom - y * this.plotHeight * 0.96).toFixed(1);
-      d += `L${this.px(from + i * width).toFixed(1)} ${top}L${this.px(from + (i + 1) * width).toFixed(1)} ${top}`;
-    });
-    setAttr(this.bars, "d", `${d}L${this.px(to).toFixed(1)} ${this.bottom}z`);
+      return `${this.px(from + i * width).toFixed(1)} ${top}L${this.px(from + (i + 1) * width).toFixed(1)} ${top}`;
+    }).join("L");
+    setAttr(this.bars, "d", `M${this.px(from).toFixed(1)} ${this.bottom}L${tops}L${this.px(to).toFixed(1)} ${this.bottom}z`);
+    setAttr(this.outline, "d", `M${tops}`);
   }
 
   drawGrid() {

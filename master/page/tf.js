@@ -9,7 +9,10 @@ import { clamp, significant } from "./camera.js";
 
 /** @typedef {import("./types.js").Tf} Tf */
 
-/** Default light, as common/src/shade.rs has it. */
+/**
+ * Default light, as common/src/shade.rs has it.
+ * @type {import("./types.js").Shading}
+ */
 export const LIGHT = { on: true, ambient: 0.02, diffuse: 1, specular: 0.1, power: 20, light: "key" };
 
 /** @param {number} c  sRGB, 0 to 1 */
@@ -320,7 +323,7 @@ export function emphasised(tf, from, to, factor, range) {
 /**
  * Changes light.
  * @param {Tf} tf
- * @param {object} patch
+ * @param {Partial<import("./types.js").Shading>} patch
  * @returns {Tf}
  */
 export const withLight = (tf, patch) => ({ ...tf, shading: { ...LIGHT, ...tf.shading, ...patch } });

@@ -107,6 +107,6 @@
  * @property {number} fullW
  * @property {number} fullH
  * @property {number} bound
- * @property {Uint8Array} data
+ * @property {Uint8Array<ArrayBuffer>} data
  */
 export {};

@@ -30,7 +30,7 @@ export function viewPanel(core) {
   const roll = numberField({ label: "Lean", unit: "°", step: 5, min: -180, max: 180,
     onchange: (x) => cam({ roll: x }) });
   const height = numberField({ label: "Height shown", unit: "mm", step: 10,
-    onchange: (x) => cam({ height: significant(clamp(x, ...heightLimits(core.volume)), 5) }) });
+    onchange: (x) => cam({ height: significant(clamp(x, ...heightLimits(core.opened)), 5) }) });
   const target = ["x", "y", "z"].map((name, i) => numberField({
     label: name, onchange: (x) => cam({ target: core.state.cam.target.map((t, k) => (k === i ? x : t)) }),
   }));
@@ -61,7 +61,7 @@ export function viewPanel(core) {
     h("span", { class: "away", text: "Background colour" })));
   const axes = [["+x"], ["-x"], ["+y"], ["-y"], ["+z"],
     ["-z"]].map(([a]) => /** @type {[string, string]} */ ([a, a.replace("-", "−")]));
-  const up = choice("Up", axes, (v) => core.change({ up: v === core.volume.up ? null : v, front: null }, ""));
+  const up = choice("Up", axes, (v) => core.change({ up: v === core.opened.up ? null : v, front: null }, ""));
   const front = choice("Front", axes, (v) => core.change({ front: v, up: core.state.up }, ""));
   const standing = h("section", {}, h("header", {}, h("h2", { text: "How it stands" })),
     h("p", { class: "hint", text: "The file does not say. If it lies on its side, choose another up." }),
@@ -101,7 +101,7 @@ export function viewPanel(core) {
     background.value = state.background;
     for (const b of swatches.querySelectorAll("button")) b.setAttribute("aria-pressed",
       String(rgbEqual(b, state.background)));
-    up.set(state.up ?? core.volume.up);
+    up.set(state.up ?? core.opened.up);
     const standsOn = (/** @type {number[]} */ v) => `${v.some((x) => x < 0) ? "-" : "+"}${"xyz"[v.findIndex((x) => x !== 0)]}`;
     front.set(standsOn(core.axes.front));
     for (const option of front.select.options) option.disabled = option.value.endsWith(up.select.value.slice(-1));

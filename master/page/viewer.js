@@ -30,9 +30,16 @@ class Pass {
     /** @type {any} */
     this.done = null;
     this.doneAt = 0;
-    this.bound = 0;
+    /** Pixels that came, those on the screen, and the sum of the former times their bound squared. */
+    this.pixels = 0;
+    this.painted = 0;
+    this.squares = 0;
   }
   get complete() { return this.done && this.decoded === this.came; }
+  /** How far the picture may be off the still: root mean square, share of full scale; NaN: unknown. */
+  get bound() { return Math.sqrt(this.squares / this.pixels); }
+  /** Share of the picture that is on the screen. */
+  get share() { return this.painted / (this.size[0] * this.size[1]); }
   /** @param {{seq: number, scene: number, still: boolean}} other */
   is(other) { return this.seq === other.seq && this.scene === other.scene && this.still === other.still; }
 }
@@ -100,7 +107,8 @@ export class Viewer {
     if (!this.pass?.is(tile) || tile.first && this.pass.came) this.begin(new Pass(tile));
     const pass = /** @type {Pass} */ (this.pass);
     pass.came++;
-    pass.bound = tile.bound;
+    pass.pixels += tile.w * tile.h;
+    pass.squares += tile.w * tile.h * tile.bound ** 2;
     decodeTile(tile).then((bitmap) => {
       pass.ready.push({ bitmap, x: tile.x, y: tile.y });
     }, () => { pass.failed++; }).finally(() => {
@@ -178,9 +186,13 @@ export class Viewer {
       if (pass.complete) this.show(pass);
       return;
     }
-    for (const { bitmap, x, y } of pass.ready) this.stillCtx.drawImage(bitmap, x, y);
+    for (const { bitmap, x, y } of pass.ready) {
+      this.stillCtx.drawImage(bitmap, x, y);
+      pass.painted += bitmap.width * bitmap.height;
+    }
     this.drop(pass);
     if (pass.complete) this.finish(pass);
+    else if (pass.painted) this.core.emit("progress", { seq: pass.seq, scene: pass.scene, share: pass.share });
   }
 
   /** @param {Pass} pass */

@@ -44,6 +44,19 @@ export async function decodeTile(tile) {
 }
 
 /**
+ * Decodes a tile; null if it can't be decoded.
+ * @param {Tile} tile
+ * @returns {Promise<ImageBitmap|null>}
+ */
+export async function decodedOrNull(tile) {
+  try {
+    return await decodeTile(tile);
+  } catch {
+    return null;
+  }
+}
+
+/**
  * Order of two pairs (seq, scene): below 0 if `a` is older.
  * @param {{seq: number, scene: number}} a
  * @param {{seq: number, scene: number}} b

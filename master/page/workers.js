@@ -11,7 +11,7 @@ export function workersPanel(core) {
   const known = new Map();
   const now = () => Date.now() + core.clockOffset;
   const rows = new Rows({
-    label: "Workers", rem: 6.9, empty: "No worker is connected. Start one: slabcast worker --master HOST:PORT",
+    label: "Workers", rem: 7.8, empty: "No worker is connected. Start one: slabcast worker --master HOST:PORT",
     make: () => {
       const row = /** @type {any} */ ({});
       row.name = h("b");
@@ -38,12 +38,12 @@ export function workersPanel(core) {
       row.memory.max = Math.max(w.memory_bytes, 1);
       row.memory.value = w.held_bytes;
       setText(row.memoryWords, bytesWords(w.held_bytes));
-      const error = w.last_error ? `last error ${durationWords(now() - w.last_error.at_ms)} ago: ${w.last_error.text}` : "";
-      setText(row.words, [w.address || "in this process", w.rtt_ms != null && `${w.rtt_ms.toFixed(1)} ms`,
-        w.damaged ? `${w.damaged} damaged` : "", `since ${durationWords(now() - w.joined_ms)}`,
-        error].filter(Boolean).join(" · "));
+      const error = w.last_error ? `${durationWords(now() - w.last_error.at_ms)} ago: ${w.last_error.text}` : "";
+      setText(row.words, [error, w.address || "in this process", w.rtt_ms != null && `${w.rtt_ms.toFixed(1)} ms`,
+        w.damaged ? `${w.damaged} damaged` : "", `since ${durationWords(now() - w.joined_ms)}`].filter(Boolean).join(" · "));
       setAttr(row.words, "title", `${row.words.textContent} · ${w.simd} · ${w.tasks_done} tasks · holds ${bytesWords(w.held_bytes)} of ${bytesWords(w.memory_bytes)}`);
       row.words.classList.toggle("bad", !!w.last_error);
+      row.words.classList.toggle("why", !!w.last_error);
     },
   });
   const count = h("span", { class: "aside" });

@@ -125,6 +125,47 @@ def mouse_and_keys(p):
     claim("a double click makes its surface the target", p.until(f"slabcast.core.state.cam.target.join() !== '{','.join(map(str, target))}'", 20))
 
 
+def strip(p):
+    """The line below the picture, while previews and stills take turns."""
+    p.page.focus("#stage")
+    parts = "JSON.stringify([...document.querySelectorAll('#strip span')].map(e => Math.round(e.getBoundingClientRect().x)))"
+    words = "document.querySelector('#strip').textContent"
+    p.drag(40, 0)
+    p.rest()
+    places, seen = {p.ask(parts)}, set()
+    x, y = p.stage()
+    p.page.mouse.move(x, y)
+    p.page.mouse.down()
+    for i in range(25):
+        p.page.mouse.move(x + 4 * i, y)
+        time.sleep(0.04)
+        places.add(p.ask(parts))
+        seen.add(p.ask(words))
+    p.page.mouse.up()
+    while not p.ask("slabcast.viewer.atRest"):
+        places.add(p.ask(parts))
+        seen.add(p.ask(words))
+    claim("a preview says its size and how far it is off", any("preview " in w and "/255 off" in w for w in seen), str(sorted(seen)[-1:]))
+    claim("a still says how much of it is there", any("% sharp" in w for w in seen))
+    claim("nothing moves in the line", len(places) == 1, str(places))
+
+
+def steps_and_escape(p):
+    count = "slabcast.core.steps.past.length"
+    before = p.ask(count)
+    p.drag(30, 0)
+    p.drag(30, 0)
+    claim("two drags are two steps", p.ask(count) == before + 2)
+    p.page.keyboard.press("1")
+    now = p.ask(count)
+    p.page.keyboard.press("1")
+    claim("what changes nothing is no step", p.ask(count) == now)
+    p.tab("view")
+    for _ in range(2):
+        p.page.keyboard.press("Escape")
+    claim("Escape closes the panel", p.ask("document.querySelector('#panel').hidden"))
+
+
 def curve(p):
     p.tab("colour")
     n = lambda: p.ask("[slabcast.core.state.tf.opacities.length, slabcast.core.state.tf.colors.length].join()")
@@ -147,6 +188,14 @@ def curve(p):
     cell.press("Enter")
     claim("the table changes the curve", p.ask("slabcast.core.state.tf.opacities[0][1]") == 0.125)
     p.page.click("text=All points as a table")
+    fields = {name: p.page.locator(f"#panel-colour label:has-text('{name}') input").first for name in ("From", "To", "Width", "Level")}
+    fields["Level"].fill("100")
+    fields["Level"].press("Enter")
+    of = {name: float(f.input_value()) for name, f in fields.items()}
+    claim("the window has a level and a width", abs(of["From"] + of["To"] - 200) < 1 and abs(of["To"] - of["From"] - of["Width"]) < 0.1, str(of))
+    fields["Level"].fill("7")
+    fields["Level"].press("Escape")
+    claim("Escape puts a number back", float(fields["Level"].input_value()) == of["Level"])
 
 
 def same_pixels(p, slabcast, volume):
@@ -264,7 +313,7 @@ def main():
         p = Page(browser, args.url, viewport={"width": 900, "height": 620}, color_scheme="dark")
         requests = p.ask("performance.getEntriesByType('resource').length + 1")
         claim("at most 8 requests", requests <= 8, str(requests))
-        for part in (mouse_and_keys, curve):
+        for part in (mouse_and_keys, curve, steps_and_escape, *([] if args.real else [strip])):
             part(p)
         same_pixels(p, args.slabcast, args.volume)
         address(p)

@@ -174,6 +174,8 @@ class Session:
         self.drawn = None
         self.still_task = None
         self.changed_at = 0.0
+        self.preview = None
+        self.off = {}
 
     async def send(self, message):
         m = self.master
@@ -280,6 +282,10 @@ class Session:
                     self.still_task.cancel()
                 self.still_task = asyncio.create_task(self.still(pair))
 
+    def setting(self):
+        """What the distance of previews from their stills goes by: all but the camera."""
+        return json.dumps([{k: v for k, v in self.scene.items() if k not in ("rev", "moving")}, self.view["size"]])
+
     async def moving(self, pair):
         size, (w, h) = self.view["size"], self.view["size"]
         k = min(1, 150 / h)
@@ -287,13 +293,15 @@ class Session:
         start = time.monotonic()
         pixels = await asyncio.to_thread(self.master.rays.draw, self.scene, self.view["camera"], small)
         drawn = time.monotonic()
+        self.preview = pair, pixels
+        bound = self.off.get(self.setting(), math.nan)
         self.inflight += 1
         sent = 0
         for n, (x, y, part) in enumerate(tiles(pixels, 128)):
             data = io.BytesIO()
             Image.fromarray(part).save(data, "JPEG", quality=80)
             sent += data.tell()
-            await self.send(header(1, FIRST * (n == 0), pair, x, y, part, small, 0.08) + data.getvalue())
+            await self.send(header(1, FIRST * (n == 0), pair, x, y, part, small, bound) + data.getvalue())
         end = time.monotonic()
         await self.send({"type": "done", "seq": pair[0], "scene": pair[1], "pass": "moving", "size": small, "level": 2, "bytes": sent,
                          "ms": {"wait": 0.3, "draw": (drawn - start) * 1e3, "encode": (end - drawn) * 1e3, "total": (end - start) * 1e3},
@@ -308,6 +316,9 @@ class Session:
             await self.send({"type": "refused", "re": "scene", "id": pair[1], "reason": "invalid_field", "field": "tf", "problem": str(e), "remedy": ""})
             return
         drawn = time.monotonic()
+        if self.preview and self.preview[0] == pair:
+            stretched = np.asarray(Image.fromarray(self.preview[1]).resize(pixels.shape[1::-1], Image.BILINEAR), np.float32)
+            self.off[self.setting()] = float(np.sqrt(np.mean((stretched - pixels) ** 2))) / 255
         rgba = np.dstack([pixels, np.full(pixels.shape[:2], 255, np.uint8)])
         sha = hashlib.sha256(rgba.tobytes()).hexdigest()
         sent, w, h = 0, pixels.shape[1], pixels.shape[0]

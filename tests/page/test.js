@@ -1,6 +1,7 @@
 /**
  * Tests of the page's pure rooms. In a browser (test.html) results lie in `globalThis.results`:
- * {done, passed, failed: [{name, problem}]}. `node --experimental-default-type=module tests/page/test.js` prints them.
+ * {done, passed, failed: [{name, problem}]}. `deno run tests/page/test.js` prints them, and node does, too:
+ * `node --experimental-default-type=module tests/page/test.js`.
  */
 
 import * as camera from "../../master/page/camera.js";
@@ -11,6 +12,7 @@ import * as state from "../../master/page/state.js";
 import * as tf from "../../master/page/tf.js";
 import { pairOrder, parseTile, waitBeforeDial } from "../../master/page/wire.js";
 import { applyDelta } from "../../master/page/rows.js";
+import { errorWords, previewWords, stateWords, timeWords } from "../../master/page/shown.js";
 
 /** @type {[string, () => any][]} */
 const stories = [];
@@ -255,6 +257,16 @@ story("a hundred steps can be undone, and a drag is one", () => {
   same([n, steps.now.n], [100, 51]);
   same(steps.redo(), { n: 52 });
 });
+story("a drag is one step however long it takes, and the next drag is another", () => {
+  const steps = new state.Steps({ n: 0 });
+  let at = 0;
+  for (const hand of [1, 2]) {
+    steps.hold(true);
+    for (let i = 0; i < 3; i++) steps.push({ n: hand * 10 + i }, "hand", at += hand === 1 ? 5000 : 10);
+    steps.hold(false);
+  }
+  same([steps.undo(), steps.undo(), steps.undo()], [{ n: 12 }, { n: 0 }, null]);
+});
 story("a turn has the frames and the step of its length", () => {
   const s = state.homeState(volume);
   const path = state.filmPath({ ...s, film: { ...s.film, degrees: 360, seconds: 2, fps: 30 } }, volume, [64, 64]);
@@ -294,6 +306,22 @@ story("pairs have an order", () => {
 });
 story("dialling again waits longer each time, to a limit", () => {
   same([0, 1, 2, 9].map((n) => waitBeforeDial(n, 0.5)), [250, 500, 1000, 8000]);
+});
+story("a preview says its size, and how far it is off once somebody knows", () => {
+  same(stateWords({ pass: "moving", size: [171, 171] }), "preview 171×171");
+  same([NaN, 0, 0.0001, 0.0017, 5.03 / 255, 9.4 / 255, 9.6 / 255, 23.4 / 255].map(previewWords), ["", "under 0.1/255 off",
+    "under 0.1/255 off", "about 0.4/255 off", "about 5/255 off", "about 9/255 off", "about 10/255 off", "about 23/255 off"]);
+});
+story("a still says how much of it is there, and is not sharp before it is whole", () => {
+  const still = { pass: "still", size: [512, 512] };
+  same([0, 0.624, 0.9999, 1].map((share) => stateWords(still, share)), ["0 % sharp", "62 % sharp", "99 % sharp", "sharp"]);
+  same(stateWords(still), "sharp");
+  same([3.14, 9.97, 1211.3, 9999.4, 9999.6, 30_017].map(timeWords), ["3.1 ms", "10 ms", "1211 ms", "9999 ms", "10 s", "30 s"]);
+});
+story("errors of a still are one sum, or nothing while a part is unknown", () => {
+  const [a, b] = [{ value: 0.25, kind: "bound" }, { value: 0.125, kind: "both" }];
+  same([errorWords({ a, b }), errorWords({ a, b: { ...b, kind: "estimate" } }), errorWords({ a, b: null }), errorWords({})],
+    ["at most 0.4/255 off", "about 0.4/255 off", "", ""]);
 });
 story("deltas change, add and remove", () => {
   const known = new Map();

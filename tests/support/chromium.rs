@@ -39,6 +39,7 @@ pub(crate) struct Screen {
 pub(crate) type Key = (&'static str, &'static str, u32);
 pub(crate) const TAB: Key = ("Tab", "Tab", 9);
 pub(crate) const ENTER: Key = ("Enter", "Enter", 13);
+pub(crate) const ESCAPE: Key = ("Escape", "Escape", 27);
 pub(crate) const RIGHT: Key = ("ArrowRight", "ArrowRight", 39);
 
 impl Chromium {

@@ -1,7 +1,7 @@
 //! The page of a master: its flags, and serving it beside gRPC.
 
 use crate::page_files::PageFiles;
-use slabcast_live::{Home, LiveConfig};
+use slabcast_live::{Home, LiveConfig, escaped};
 use slabcast_master::Handle;
 use slabcast_master::serve::serve_with_pages;
 use slabcast_session::fail::Fail;
@@ -50,6 +50,12 @@ fn token(file: &Path) -> Result<String, Fail> {
 }
 
 impl PageArgs {
+    /// Returns the first of the flags that is given, without its dashes.
+    pub(crate) fn given(&self) -> Option<&'static str> {
+        let host = (!self.allowed_host.is_empty()).then_some("allowed-host");
+        host.or(self.page_token.is_some().then_some("page-token"))
+    }
+
     /// Returns the settings of the page.
     ///
     /// # Errors
@@ -84,16 +90,6 @@ pub(crate) fn url(address: SocketAddr, config: &LiveConfig) -> String {
     };
     let token = config.token.as_ref().map(|token| format!("#t={}", escaped(token)));
     format!("http://{host}:{port}/{}", token.unwrap_or_default())
-}
-
-/// Escapes what an address can't hold.
-fn escaped(text: &str) -> String {
-    let escape = |b: u8| match b {
-        b'-' | b'.' | b'_' | b'~' => char::from(b).to_string(),
-        b if b.is_ascii_alphanumeric() => char::from(b).to_string(),
-        b => format!("%{b:02X}"),
-    };
-    text.bytes().map(escape).collect()
 }
 
 /// Serves gRPC and the page on one listener until `stop` turns true.

@@ -6,12 +6,14 @@
 //! - `session` is one page: it reads, draws, encodes and writes. `picture` draws one pass as a job of
 //!   one frame of the master, `tile` encodes it.
 //! - `volume` describes a volume for an editor, `news` tells of jobs, workers and volumes.
+//! - `address` writes the fragments of the page's address.
 //! - `guard` knows who may call, `http` and `uploads` have the calls beside the socket, `assets` the page's
 //!   files. [`Files`] writes what people keep; the program brings it.
 //!
 //! Nothing here draws: workers do. Nothing slow runs on the runtime's threads: reading and encoding
 //! have threads of their own.
 
+mod address;
 mod assets;
 mod blocks;
 mod files;
@@ -31,6 +33,7 @@ mod tile;
 mod uploads;
 mod volume;
 
+pub use address::{escaped, fragment};
 pub use files::{Files, MadeFile, Making, Recipe};
 pub use server::serve;
 pub use shared::LiveConfig;

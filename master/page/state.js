@@ -46,11 +46,12 @@ export function homeState(volume) {
   const base = {
     azimuth: 20, elevation: 0, roll: 0, ...boxFraming(volume.box), projection: "ortho", fov: 30,
   };
-  const preset = volume.presets.find((p) => p.name === volume.home.tf) ?? volume.presets[0];
+  const { tf } = volume.home;
+  const preset = typeof tf === "string" ? volume.presets.find((p) => p.name === tf) ?? volume.presets[0] : null;
   return {
     volume: volume.name, digest: volume.digest, up: null, front: null,
     cam: camOfKey(volume.home.camera, o, base),
-    preset: preset.name, tf: plainTf(preset.tf, volume.range),
+    preset: preset?.name ?? null, tf: plainTf(preset?.tf ?? tf, volume.range),
     crop: noCrop(), background: "#000000", quality: {}, film: newFilm(),
   };
 }

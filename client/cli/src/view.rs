@@ -14,7 +14,6 @@ use slabcast_live::Home;
 use slabcast_master::library::{Source, UploadConfig};
 use slabcast_master::memory::available;
 use slabcast_master::{Library, LibraryConfig};
-use slabcast_scene::presets;
 use slabcast_session::embedded::{Cluster, SHARED, WorkerGroup};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress;
@@ -36,6 +35,7 @@ const UPLOADS: u64 = 16 << 30;
 Examples:
   slabcast view brain.nii.gz --open
   slabcast view ct.nrrd --tf bone
+  slabcast view ct.nrrd --tf bone.json
   slabcast view head.raw --up=-y
   On the page of a master, which has the volume or gets it:
       slabcast view knee --master node1:7433 --open
@@ -51,8 +51,9 @@ pub(crate) struct ViewArgs {
     input: volume::InputArgs,
     #[command(flatten)]
     axes: AxisArgs,
-    /// Preset or colour map of the first picture [default: auto]
-    #[arg(long, value_name = "NAME", value_parser = NameOrFile::TRANSFER, hide_possible_values = true)]
+    /// Colours of the first picture: a preset, a colour map, or a JSON file of ours or ParaView's
+    /// [default: auto]
+    #[arg(long, value_name = "NAME|FILE", value_parser = NameOrFile::TRANSFER, hide_possible_values = true)]
     tf: Option<String>,
     /// Open the page in this machine's browser
     #[arg(long)]
@@ -88,26 +89,17 @@ pub(crate) fn run(args: &ViewArgs) -> Result<(), Fail> {
     }
     let Some(volume) = &args.volume else { unreachable!("clap asks for VOLUME without --master") };
     let crew = WorkerGroup::new(args.workers.unwrap_or(1), args.threads)?;
-    let tf = args.tf.as_deref().unwrap_or("auto");
-    let is_known = presets::NAMES.iter().chain(&presets::MAPS).any(|(name, _)| *name == tf);
-    if !is_known && Path::new(tf).is_file() {
-        return Err(Fail::usage(format!(
-            "--tf: `{tf}` is a file, and a page begins with a preset; give a preset's name, or draw pictures \
-             with `slabcast render --tf {tf}`"
-        )));
-    }
-    if !is_known {
-        return Err(Fail::flag(&presets::unknown_name(tf)));
-    }
-    let file = volume.to_string_lossy().into_owned();
-    let home = Home { tf: Some(tf.into()), file: Some(file) };
-    let config = args.page.config(home)?;
+    let transfer = Transfer::read(args.tf.as_deref().unwrap_or("auto"))?;
+    let mut config = args.page.config(Home::default())?;
     let runtime = runtime::start()?;
     // A port in use is told before a large file is read.
     let listen_at = args.listen.as_deref().unwrap_or("127.0.0.1:0");
     let socket = runtime.block_on(bind(listen_at, args.insecure))?;
     let opened = args.input.open_source(volume)?;
     let orientation = args.axes.for_info(opened.info())?;
+    function(&transfer, opened.info())?;
+    let file = volume.to_string_lossy().into_owned();
+    config.home = Home { tf: Some(transfer.choice(opened.info())), file: Some(file) };
     // Workers share the master's bricks of a volume in memory; of a file both drop what exceeds
     // their memory.
     let brick_bytes = match opened.source.whole(0) {

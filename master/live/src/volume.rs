@@ -11,7 +11,7 @@ use slabcast_scene::path::{Fit, Framing, Key, KeyFrames, Orientation, ViewPath};
 use slabcast_scene::presets::{self, Levels};
 use slabcast_scene::request::VolumeChoice;
 use slabcast_scene::transfer::TransferChoice;
-use slabcast_scene::values::in_values;
+use slabcast_scene::values::{as_read_from_file, in_values};
 use slabcast_volumes::framing::framing_of;
 use std::sync::Arc;
 
@@ -87,10 +87,15 @@ fn presets_of(info: &VolumeInfo) -> Vec<Value> {
     let fitted = named.chain(maps).filter_map(|((name, words), is_map)| {
         let tf = presets::by_name(name, &info.summary).ok()?;
         let share = visible_share(&tf, info);
-        let tf: Value = serde_json::from_str(&in_values(&tf, info).to_json()).ok()?;
+        let tf = told(&tf, info);
         Some(json!({"name": name, "for": words, "share": share, "map": is_map, "tf": tf}))
     });
     fitted.collect()
+}
+
+/// Returns a function as messages tell it: over the values of the file.
+fn told(tf: &TransferFunction, info: &VolumeInfo) -> Value {
+    serde_json::to_value(in_values(tf, info)).unwrap_or_default()
 }
 
 /// Returns a choice's function in full.
@@ -152,10 +157,19 @@ fn rounded(x: f64, decimals: i32) -> f64 {
 /// Scene that a page shows first.
 #[derive(Clone, Debug, Default)]
 pub struct Home {
-    /// Preset of the first picture; default `auto`.
-    pub tf: Option<String>,
-    /// Path that command lines give for the volume; `None`: its name.
+    /// Preset or function of the first picture; default `auto`. A preset is that of all volumes, a
+    /// function that of the volume with which the master was started: others begin with `auto`.
+    pub tf: Option<TransferChoice>,
+    /// Path that command lines give for the volume with which the master was started; `None`: its name.
     pub file: Option<String>,
+}
+
+impl Home {
+    /// Returns the scene of another volume than that with which the master was started.
+    pub(crate) fn of_another(&self) -> Home {
+        let preset = self.tf.clone().filter(|tf| matches!(tf, TransferChoice::Name(_)));
+        Home { tf: preset, file: None }
+    }
 }
 
 /// Describes an open volume for a picture of `size`. Takes a tenth of a second: what can be seen is
@@ -172,8 +186,12 @@ pub(crate) fn describe(
     let served = &open.served;
     let info = &served.info;
     let (summary, lattice) = (&info.summary, &info.lattice);
-    let preset = home.tf.as_deref().unwrap_or("auto");
-    let tf = presets::by_name(preset, summary).map_err(|e| Problem::field(&e))?;
+    let home_tf = home.tf.clone().unwrap_or_else(|| TransferChoice::Name("auto".into()));
+    let tf = function(&as_read_from_file(home_tf.clone(), info), info)?;
+    let told_tf = match &home_tf {
+        TransferChoice::Name(preset) => preset.as_str().into(),
+        TransferChoice::Function(tf) => told(tf, info),
+    };
     let Orientation { up, front } = served.orientation;
     let key = Key { azimuth: Some(HOME_AZIMUTH), elevation: Some(0.0), ..Key::default() };
     let keyframes = KeyFrames {
@@ -221,13 +239,13 @@ pub(crate) fn describe(
         "hounsfield": Levels::from_summary(summary).water.is_some(),
         "nan": summary.nan,
         "presets": presets_of(info),
-        "home": {"camera": camera, "tf": preset},
+        "home": {"camera": camera, "tf": told_tf},
     });
     Ok(Shown {
         served: served.clone(),
         is_large: open.source.whole(open.level).is_none(),
         home: camera,
-        home_tf: TransferChoice::Name(preset.into()),
+        home_tf,
         message: Arc::new(message),
     })
 }

@@ -717,7 +717,10 @@ async fn opened(
             }
         };
         let open = library.open(&choice, viewer)?;
-        let name = library.name_of(open.served.info.digest, viewer);
+        let digest = open.served.info.digest;
+        let name = library.name_of(digest, viewer);
+        let is_own = library.default_volume().is_some_and(|own| own.info.digest == digest);
+        let home = if is_own { home } else { home.of_another() };
         describe(&open, name, size, &home).map(Some)
     });
     described.await.ok_or_else(Problem::ending)?

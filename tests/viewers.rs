@@ -67,6 +67,29 @@ async fn page_begins_with_the_function_of_a_file_as_render_draws_it() {
     }
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn links_of_workers_and_slopes_of_volumes_are_told() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let (_view, port) = view(dir.path(), &[VOLUME]);
+    let mut page = Live::dial(port, json!({"watch": ["workers"]})).await;
+    let volume = page.until("volume").await;
+    let gradients = &volume["gradients"];
+    assert!(gradients["to"].as_f64().is_some_and(|to| to > 0.0), "{gradients}");
+    let counts = gradients["counts"].as_array().expect("counts").iter();
+    let counts: Vec<u64> = counts.map(|n| n.as_u64().expect("a count")).collect();
+    assert_eq!((counts.len(), counts.iter().sum::<u64>()), (64, 40 * 40 * 40));
+    // Pings are answered within a moment.
+    loop {
+        let news = page.until("workers").await;
+        let Some(worker) = news["changed"].get(0) else { continue };
+        assert_eq!(worker["last_error"], Value::Null, "{worker}");
+        if let Some(ms) = worker["rtt_ms"].as_f64() {
+            assert!((0.0..60_000.0).contains(&ms), "{worker}");
+            break;
+        }
+    }
+}
+
 #[test]
 fn functions_that_can_not_be_used_are_refused_before_a_page_is_served() {
     let dir = tempfile::tempdir().expect("a folder");

@@ -5,7 +5,8 @@
 //! - `slot` decides which pass a session draws next, `preview` how coarsely it moves; both are pure.
 //! - `session` is one page: it reads, draws, encodes and writes. `picture` draws one pass as a job of
 //!   one frame of the master, `tile` encodes it.
-//! - `volume` describes a volume for an editor, `news` tells of jobs, workers and volumes.
+//! - `volume` describes a volume for an editor, `descriptions` keeps what was described,
+//!   `gradients` counts slopes, `news` tells of jobs, workers and volumes.
 //! - `address` writes the fragments of the page's address.
 //! - `guard` knows who may call, `http` and `uploads` have the calls beside the socket, `assets` the page's
 //!   files. [`Files`] writes what people keep; the program brings it.
@@ -16,7 +17,9 @@
 mod address;
 mod assets;
 mod blocks;
+mod descriptions;
 mod files;
+mod gradients;
 mod guard;
 mod http;
 mod messages;

@@ -53,6 +53,10 @@ const GOODBYE: Duration = Duration::from_secs(2);
 /// of one that was read can it.
 const SOCKET_BYTES: usize = 2 << 20;
 
+/// Bytes that are read from a socket at a time. Each session holds so many; messages of a hand that
+/// moves have 200, and longer ones come in pieces.
+const READ_BYTES: usize = 4 << 10;
+
 /// An answer, or a refusal.
 pub(crate) type Answer = Result<Response, Problem>;
 
@@ -66,6 +70,7 @@ pub async fn serve(
     mut stop: watch::Receiver<bool>,
 ) {
     let shared = Arc::new(Shared::new(handle, config, files, stop.clone()));
+    tokio::spawn(session::prepare(shared.clone()));
     let mut of_peers: BTreeMap<IpAddr, usize> = BTreeMap::new();
     let mut open = JoinSet::new();
     loop {
@@ -258,6 +263,7 @@ async fn upgrade(shared: Arc<Shared>, caller: Caller, request: Request<Body>) ->
     let upgrade = upgrade
         .max_message_size(SOCKET_BYTES)
         .max_frame_size(SOCKET_BYTES)
+        .read_buffer_size(READ_BYTES)
         .write_buffer_size(0)
         .max_write_buffer_size(8 << 20);
     let peer = Some(caller.peer.ip());

@@ -1,5 +1,6 @@
 //! State shared by all sessions and HTTP calls of a master's page.
 
+use crate::descriptions::Descriptions;
 use crate::files::Files;
 use crate::guard::Guard;
 use crate::volume::Home;
@@ -47,6 +48,7 @@ pub(crate) struct Shared {
     pub(crate) states: crate::http::States,
     pub(crate) results: crate::http::Results,
     pub(crate) uploads: crate::uploads::Uploads,
+    pub(crate) descriptions: Descriptions,
     started: Instant,
     last_id: AtomicU64,
 }
@@ -69,6 +71,7 @@ impl Shared {
             states: Default::default(),
             results: Default::default(),
             uploads: Default::default(),
+            descriptions: Default::default(),
             started: Instant::now(),
             last_id: AtomicU64::new(0),
         }

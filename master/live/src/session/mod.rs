@@ -8,6 +8,7 @@ mod asks;
 mod passes;
 mod thumbs;
 
+use crate::descriptions::Described;
 use crate::messages::{Ack, Head, Hello, LONGEST, Open, Ping, Scene, View, WatchAsk};
 use crate::picture::{Drawn, Early, check_size};
 use crate::preview::Preview;
@@ -81,7 +82,7 @@ struct End(u16, String);
 /// Result of a task that a session started.
 pub(super) enum Outcome {
     /// A volume was opened, or not.
-    Opened { open: Box<Opening>, result: Result<Option<Box<Shown>>, Problem> },
+    Opened { open: Box<Opening>, result: Result<Option<Described>, Problem> },
     /// A pass was drawn. `number`: which.
     Drawn { number: u64, result: Result<Box<Drawn>, Problem> },
     /// The present state of what is watched.
@@ -436,7 +437,7 @@ impl Session {
         let (shared, viewer, size) = (self.shared.clone(), self.viewer, self.size);
         self.tasks.spawn(async move {
             let result = opened(&shared, open.name.clone(), viewer, size).await;
-            Outcome::Opened { open, result: result.map(|shown| shown.map(Box::new)) }
+            Outcome::Opened { open, result }
         });
     }
 
@@ -446,7 +447,7 @@ impl Session {
             Outcome::Opened { open, result } => {
                 self.opening = None;
                 match result {
-                    Ok(Some(shown)) => self.show(*shown, *open),
+                    Ok(Some(described)) => self.show(described, *open),
                     // A master without volumes waits for the first.
                     Ok(None) => {}
                     Err(problem) => {
@@ -520,15 +521,15 @@ impl Session {
     }
 
     /// Shows a volume that was opened.
-    fn show(&mut self, shown: Shown, open: Opening) {
+    fn show(&mut self, described: Described, open: Opening) {
+        let Described { shown, message } = described;
         let Opening { hello, id, then: First { view, scene }, .. } = open;
         self.drop_pass();
         self.drop_thumb();
         self.slot.clear();
         self.preview = Preview::default();
         self.frame = None;
-        self.say(&shown.message);
-        let shown = Arc::new(shown);
+        self.send(Some(Message::Text(message)));
         self.shown = Some(shown.clone());
         let re = if hello { "hello" } else { "open" };
         // The home view has the numbers of the latest view and scene.
@@ -695,6 +696,21 @@ pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, Problem> {
     serde_json::from_str(text).map_err(|e| Problem::json(&e))
 }
 
+/// Size of the pictures for which a master describes its own volume at its start: a page beside its
+/// panel on a usual screen. Pictures of another size share the most of it.
+const USUAL_SIZE: [u32; 2] = [1280, 960];
+
+/// Describes the volume of `slabcast view`, so that the first page needn't wait for it. Of another
+/// master nobody may ever ask for the page.
+pub(crate) async fn prepare(shared: Arc<Shared>) {
+    if shared.config.home.file.is_none() {
+        return;
+    }
+    if let Err(problem) = opened(&shared, None, Viewer::own(), USUAL_SIZE).await {
+        debug!(problem = problem.problem, "the volume can't be described yet");
+    }
+}
+
 /// Opens a volume and describes it, on a blocking thread. Without a name: the master's own, or its first
 /// that can be read; `None` if there is none.
 async fn opened(
@@ -702,8 +718,8 @@ async fn opened(
     name: Option<String>,
     viewer: Viewer,
     size: [u32; 2],
-) -> Result<Option<Shown>, Problem> {
-    let home = shared.config.home.clone();
+) -> Result<Option<Described>, Problem> {
+    let of_page = shared.clone();
     let described = shared.handle.reading(move |library| {
         let choice = match name {
             Some(name) => VolumeChoice::Name(name),
@@ -720,8 +736,9 @@ async fn opened(
         let digest = open.served.info.digest;
         let name = library.name_of(digest, viewer);
         let is_own = library.default_volume().is_some_and(|own| own.info.digest == digest);
-        let home = if is_own { home } else { home.of_another() };
-        describe(&open, name, size, &home).map(Some)
+        let home = &of_page.config.home;
+        let home = if is_own { home.clone() } else { home.of_another() };
+        describe(&of_page.descriptions, &open, &name, size, &home).map(Some)
     });
     described.await.ok_or_else(Problem::ending)?
 }

@@ -90,6 +90,20 @@ async fn links_of_workers_and_slopes_of_volumes_are_told() {
     }
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn sessions_beyond_the_limit_are_told_so() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let (_view, port) = view(dir.path(), &["formula:blob:8"]);
+    let mut held = Vec::new();
+    for _ in 0..64 {
+        held.push(Live::dial(port, json!({"size": [16, 16]})).await);
+    }
+    let (code, words) = Live::dial(port, json!({})).await.closed().await;
+    assert_eq!(code, 4429);
+    assert!(words.contains("as many pages are open as this master takes"), "{words}");
+    held[0].until("welcome").await;
+}
+
 #[test]
 fn functions_that_can_not_be_used_are_refused_before_a_page_is_served() {
     let dir = tempfile::tempdir().expect("a folder");

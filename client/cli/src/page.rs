@@ -27,6 +27,10 @@ pub(crate) struct PageArgs {
     /// File with a token that the page must know; its address then has it
     #[arg(long, value_name = "FILE", hide_short_help = true)]
     page_token: Option<PathBuf>,
+    /// Pages that one address may have open; this machine may have all 64 [default: 16]
+    #[arg(long, value_name = "N", hide_short_help = true,
+          value_parser = clap::value_parser!(u32).range(1..=64))]
+    peer_pages: Option<u32>,
 }
 
 /// Reads a token: one line of printable characters.
@@ -53,7 +57,8 @@ impl PageArgs {
     /// Returns the first of the flags that is given, without its dashes.
     pub(crate) fn given(&self) -> Option<&'static str> {
         let host = (!self.allowed_host.is_empty()).then_some("allowed-host");
-        host.or(self.page_token.is_some().then_some("page-token"))
+        let token = self.page_token.is_some().then_some("page-token");
+        host.or(token).or(self.peer_pages.is_some().then_some("peer-pages"))
     }
 
     /// Returns the settings of the page.
@@ -67,6 +72,7 @@ impl PageArgs {
             allowed_hosts: self.allowed_host.clone(),
             token: self.page_token.as_deref().map(token).transpose()?,
             home,
+            sessions_of_peer: self.peer_pages.map(|pages| pages as usize),
         })
     }
 }

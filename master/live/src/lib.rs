@@ -8,6 +8,7 @@
 //! - `volume` describes a volume for an editor, `descriptions` keeps what was described,
 //!   `gradients` counts slopes, `news` tells of jobs, workers and volumes.
 //! - `address` writes the fragments of the page's address.
+//! - `places` counts sessions, `write_limit` gives up connections that nobody reads.
 //! - `guard` knows who may call, `http` and `uploads` have the calls beside the socket, `assets` the page's
 //!   files. [`Files`] writes what people keep; the program brings it.
 //!
@@ -26,6 +27,7 @@ mod messages;
 mod news;
 mod pick;
 mod picture;
+mod places;
 mod preview;
 mod problem;
 mod server;
@@ -35,6 +37,7 @@ mod slot;
 mod tile;
 mod uploads;
 mod volume;
+mod write_limit;
 
 pub use address::{escaped, fragment};
 pub use files::{Files, MadeFile, Making, Recipe};

@@ -8,7 +8,8 @@ use crate::files::Files;
 use crate::http;
 use crate::problem::Problem;
 use crate::session;
-use crate::shared::{LiveConfig, SESSIONS, Shared};
+use crate::shared::{LiveConfig, Shared};
+use crate::write_limit::WriteLimit;
 use axum::body::{Body, to_bytes};
 use axum::extract::FromRequestParts;
 use axum::extract::ws::WebSocketUpgrade;
@@ -42,6 +43,9 @@ const CONNECTIONS: usize = 512;
 /// Connections of one address at a time, enough for some twenty pages. A connection that reads nothing
 /// keeps its place, so no address may take all.
 const CONNECTIONS_OF_PEER: usize = 128;
+
+/// Time after which a connection whose client takes no byte of an answer is given up.
+const STUCK: Duration = Duration::from_secs(60);
 
 /// Bytes of a request's head.
 const HEAD_BYTES: usize = 32 << 10;
@@ -105,8 +109,7 @@ pub async fn serve(
     let ended = async { while open.join_next().await.is_some() {} };
     let _ = tokio::time::timeout(GOODBYE, ended).await;
     // Sessions say goodbye.
-    let all = shared.sessions.acquire_many(SESSIONS as u32);
-    let _ = tokio::time::timeout(GOODBYE, all).await;
+    let _ = tokio::time::timeout(GOODBYE, shared.sessions.all_free()).await;
 }
 
 /// Answers the requests of one connection.
@@ -120,7 +123,7 @@ async fn talk(shared: Arc<Shared>, connection: PageConnection, mut stop: watch::
         .timer(TokioTimer::new())
         .header_read_timeout(HEAD)
         .max_buf_size(HEAD_BYTES.max(64 << 10))
-        .serve_connection(TokioIo::new(connection), service)
+        .serve_connection(TokioIo::new(WriteLimit::new(connection, STUCK)), service)
         .with_upgrades();
     let mut talking = std::pin::pin!(talking);
     let ended = tokio::select! {

@@ -40,9 +40,6 @@ const HELLO: Duration = Duration::from_secs(5);
 /// Interval of WebSocket pings.
 const PING: Duration = Duration::from_secs(20);
 
-/// Time after which a socket that takes no byte is given up.
-const STUCK: Duration = Duration::from_secs(60);
-
 /// Time for a client to take the close code and close.
 const FAREWELL: Duration = Duration::from_secs(1);
 
@@ -166,11 +163,14 @@ pub(super) fn text(value: &Value) -> Message {
 
 /// Runs a session until either side closes.
 pub(crate) async fn run(shared: Arc<Shared>, socket: WebSocket, peer: Option<IpAddr>) {
-    let Ok(_place) = shared.sessions.clone().try_acquire_owned() else {
-        let mut socket = socket;
-        let reason = "as many sessions as this master takes; dial again later".into();
-        let _ = socket.send(Message::Close(Some(CloseFrame { code: code::FULL, reason }))).await;
-        return;
+    let _place = match shared.sessions.take(peer) {
+        Ok(place) => place,
+        Err(words) => {
+            let mut socket = socket;
+            let close = CloseFrame { code: code::FULL, reason: words.into() };
+            let _ = socket.send(Message::Close(Some(close))).await;
+            return;
+        }
     };
     let (sink, mut stream) = socket.split();
     let (to_writer, from_session) = mpsc::channel(WRITING);
@@ -211,8 +211,9 @@ async fn write(mut sink: SplitSink<WebSocket, Message>, mut messages: mpsc::Rece
         };
         let Some(message) = message else { break };
         let is_last = matches!(message, Message::Close(_));
-        match tokio::time::timeout(STUCK, sink.send(message)).await {
-            Ok(Ok(())) if !is_last => {}
+        // A client that takes no byte for a minute loses its connection (`write_limit`).
+        match sink.send(message).await {
+            Ok(()) if !is_last => {}
             _ => return,
         }
     }

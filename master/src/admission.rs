@@ -405,7 +405,7 @@ mod tests {
         let audits = Audits { everybody: false, nobody: true, shut_out: Duration::from_secs(1) };
         let mut table = WorkerTable::new(false, "here".into(), 1000, audits);
         let damaged = crate::link::Damaged::default();
-        let mut admit = |table: &mut WorkerTable, name: &str| {
+        let admit = |table: &mut WorkerTable, name: &str| {
             let link = WorkerLink {
                 control: tokio::sync::mpsc::unbounded_channel().0,
                 bricks: tokio::sync::mpsc::unbounded_channel().0,

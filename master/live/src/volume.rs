@@ -307,7 +307,10 @@ mod tests {
         assert!(!Arc::ptr_eq(&one.shown, &wide.shown), "another picture is framed anew");
         let message: Value = serde_json::from_str(&one.message).expect("JSON");
         assert_eq!((&message["type"], &message["name"]), (&json!("volume"), &json!("ball")));
-        assert_eq!((&message["dims"], &message["home"]["tf"]), (&json!([16; 3]), &json!("auto")));
+        assert_eq!(
+            (&message["dims"], &message["home"]["tf"]),
+            (&json!([16, 16, 16]), &json!("auto"))
+        );
         assert_eq!(message["presets"][0]["name"], "auto");
         let counts = message["gradients"]["counts"].as_array().expect("a histogram");
         assert_eq!((counts.len(), message["gradients"]["to"].as_f64() > Some(0.0)), (64, true));

@@ -168,6 +168,55 @@ fn turned_coloured_and_cut_the_page_shows_the_bytes_of_its_command() {
 }
 
 #[test]
+fn an_address_of_view_at_a_master_opens_volume_and_colours() {
+    let _alone = alone();
+    let Some(chromium) = Chromium::start() else { return };
+    let dir = tempfile::tempdir().expect("a folder");
+    let dir = dir.path();
+    let run = |words: &[&str]| {
+        let out = processes::slabcast(dir, words).output().expect("the program runs");
+        assert!(out.status.success(), "{words:?}: {}", String::from_utf8_lossy(&out.stderr));
+        String::from_utf8(out.stdout).expect("text")
+    };
+    std::fs::create_dir(dir.join("scans")).expect("a folder");
+    for (formula, file) in [("formula:blob:40", "a.nrrd"), ("formula:spheres:40", "knee & co.nrrd")]
+    {
+        run(&["convert", formula, &format!("scans/{file}"), "-q"]);
+    }
+    let (_master, address) = processes::master_with(dir, "127.0.0.1:0", &["--volumes", "scans"]);
+    let _worker = processes::worker(dir, &address, "one", &[]);
+    let view = |words: &[&str]| {
+        let url = run(&[&["view"], words, &["--master", &address]].concat());
+        url.trim().to_string()
+    };
+    let volume = "slabcast.core.volume.name";
+    let preset = "String(slabcast.core.state.preset)";
+    let mut page = chromium.open(&view(&["knee & co.nrrd", "--tf", "bone"]), DESK);
+    let bone = rest(&mut page);
+    assert_eq!((page.words(volume), page.words(preset)), ("knee & co.nrrd".into(), "bone".into()));
+    page.end();
+    // The ending of a name may be left out, by hand too.
+    let mut page = chromium.open(&format!("http://{address}/#volume=knee%20%26%20co"), DESK);
+    let auto = rest(&mut page);
+    assert_eq!((page.words(volume), page.words(preset)), ("knee & co.nrrd".into(), "auto".into()));
+    assert_ne!(auto, bone);
+    assert_eq!(page.words("document.querySelector('#notes').textContent"), "");
+    page.end();
+    let tf = run(&["tf", "bone", "scans/knee & co.nrrd"]).replace("0.", "0.0");
+    std::fs::write(dir.join("own.json"), tf).expect("a file");
+    let mut page = chromium.open(&view(&["knee & co", "--tf", "own.json"]), DESK);
+    let own = rest(&mut page);
+    assert_eq!((page.words(volume), page.words(preset)), ("knee & co.nrrd".into(), "null".into()));
+    assert!(own != bone && own != auto, "colours of its own");
+    page.end();
+    // Without a volume its first is shown, in the colours that are asked for.
+    let mut page = chromium.open(&view(&["--tf", "bone"]), DESK);
+    rest(&mut page);
+    assert_eq!((page.words(volume), page.words(preset)), ("a.nrrd".into(), "bone".into()));
+    page.end();
+}
+
+#[test]
 fn a_lost_connection_and_a_new_master_find_the_view_again() {
     let _alone = alone();
     let Some(chromium) = Chromium::start() else { return };

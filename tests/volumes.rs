@@ -148,3 +148,45 @@ fn two_masters_do_not_share_a_folder_of_uploads() {
         .expect("text");
     assert!(said.contains("another master uses it; give each a folder"), "{said}");
 }
+
+#[test]
+fn view_prints_where_a_masters_page_shows_a_volume_and_ends() {
+    let dir = files();
+    let dir = dir.path();
+    let (_master, address) = master(dir, "127.0.0.1:0", &[]);
+    let there = ["--master", address.as_str()];
+    let view = |words: &[&str]| ok(dir, &[&["view"], words, &there[..]].concat());
+    assert_eq!(view(&[]), format!("http://{address}/\n"));
+    assert_eq!(view(&["--tf", "bone"]), format!("http://{address}/#tf=bone\n"));
+    let knee = format!("http://{address}/#volume=knee.nrrd");
+    assert_eq!(view(&["knee"]), format!("{knee}\n"));
+    assert_eq!(view(&["knee.nrrd", "--tf", "cool-warm"]), format!("{knee}&tf=cool-warm\n"));
+    // A file of this machine is put there.
+    assert_eq!(view(&["mine.nrrd"]), format!("http://{address}/#volume=mine.nrrd\n"));
+    assert!(ok(dir, &["volumes", "--master", &address]).contains("mine.nrrd"));
+    std::fs::write(dir.join("tf.json"), ok(dir, &["tf", "bone", "scans/knee.nrrd"]))
+        .expect("a file");
+    assert!(view(&["knee", "--tf", "tf.json"]).starts_with(&format!("http://{address}/#v1,")));
+
+    let refused = |words: &[&str], code: i32, says: &[&str]| {
+        let (ended, said) = fails(dir, &[&["view"], words].concat());
+        assert_eq!(ended, Some(code), "{words:?}: {said}");
+        assert!(says.iter().all(|part| said.contains(part)), "{words:?}: {said}");
+    };
+    let at = |words: &[&'static str]| [words, &["--master", "127.0.0.1:1"][..]].concat();
+    for (flag, value) in [("--listen", "127.0.0.1:0"), ("--workers", "1"), ("--threads", "1")] {
+        let says = ["leave it out", "slabcast master", flag];
+        refused(&[&["knee", flag, value][..], &there].concat(), 2, &says);
+    }
+    refused(&at(&["knee", "--page-token", "t"]), 2, &["--page-token: with --master"]);
+    refused(&at(&["knee", "--insecure"]), 2, &["--insecure: with --master"]);
+    refused(&at(&["knee", "--dims", "8x8x8"]), 2, &["--dims", "give a file as VOLUME"]);
+    refused(&at(&["knee", "--up", "z"]), 2, &["--up, --front: the master knows"]);
+    refused(&at(&["knee", "--tf", "bome"]), 2, &["--tf", "did you mean `bone`"]);
+    refused(&at(&["knee"]), 1, &["127.0.0.1:1"]);
+    refused(&[], 2, &["VOLUME", "slabcast view --help"]);
+    let says = ["no volume `foot` here; there are head.nii, knee.nrrd, mine.nrrd"];
+    refused(&[&["foot"][..], &there].concat(), 1, &says);
+    std::fs::write(dir.join("bad.json"), "{\"version\": 1}").expect("a file");
+    refused(&[&["knee", "--tf", "bad.json"][..], &there].concat(), 1, &["bad.json", "domain"]);
+}

@@ -11,7 +11,7 @@ import { clamp, keyOfCam } from "./camera.js";
 import { cropJson } from "./crop.js";
 import {
   LONGEST_ADDRESS, Steps, axesOfState, documentOf, documentOfFragment, fragmentOf, homeState,
-  stateOfDocument, tfChoice,
+  isOfVolume, stateOfDocument, tfChoice,
 } from "./state.js";
 import { Signals, Wire } from "./wire.js";
 
@@ -95,7 +95,7 @@ export class Core extends Signals {
     const token = /^#t=([^&,]+)/.exec(location.hash);
     if (token) {
       this.token = decodeURIComponent(token[1]);
-      history.replaceState(null, "", "#");
+      history.replaceState(null, "", `#${location.hash.slice(token[0].length + 1)}`);
     }
     this.wanted = await this.documentOfAddress();
     this.wire.dial();
@@ -119,7 +119,7 @@ export class Core extends Signals {
   async followAddress() {
     const doc = await this.documentOfAddress();
     if (!doc || !this.volume) return;
-    if (doc.volume?.name !== this.volume.name) {
+    if (!isOfVolume(doc, this.volume.name)) {
       this.wanted = doc;
       this.openVolume(doc.volume.name);
       return;
@@ -167,8 +167,8 @@ export class Core extends Signals {
       let first = homeState(volume);
       if (this.wanted) {
         try {
-          if (this.wanted.volume?.name !== volume.name) {
-            throw new Error(`This master has no volume named ${this.wanted.volume?.name}. This is ${volume.name}.`);
+          if (!isOfVolume(this.wanted, volume.name)) {
+            throw new Error(`This master has no volume named ${this.wanted.volume.name}. This is ${volume.name}.`);
           }
           first = stateOfDocument(this.wanted, volume);
           if (this.wanted.volume?.digest && this.wanted.volume.digest !== volume.digest) {

@@ -46,11 +46,12 @@ export function homeState(volume) {
   const base = {
     azimuth: 20, elevation: 0, roll: 0, ...boxFraming(volume.box), projection: "ortho", fov: 30,
   };
-  const preset = volume.presets.find((p) => p.name === volume.home.tf) ?? volume.presets[0];
+  const { tf } = volume.home;
+  const preset = typeof tf === "string" ? volume.presets.find((p) => p.name === tf) ?? volume.presets[0] : null;
   return {
     volume: volume.name, digest: volume.digest, up: null, front: null,
     cam: camOfKey(volume.home.camera, o, base),
-    preset: preset.name, tf: plainTf(preset.tf, volume.range),
+    preset: preset?.name ?? null, tf: plainTf(preset?.tf ?? tf, volume.range),
     crop: noCrop(), background: "#000000", quality: {}, film: newFilm(),
   };
 }
@@ -189,11 +190,35 @@ export async function fragmentOf(doc) {
 }
 
 /**
+ * Reads the short form of a fragment, `#volume=NAME&tf=NAME`, as a document without a view; null if it is
+ * another form. Throws if a name is not escaped as it should be.
+ * @param {string} hash
+ * @returns {any}
+ */
+function documentOfNames(hash) {
+  const pairs = hash.slice(1).split("&").map((pair) => pair.split("="));
+  const names = Object.fromEntries(pairs.map(([field, name]) => [field, decodeURIComponent(name ?? "")]));
+  if (!names.volume && !names.tf) return null;
+  return { version: 1, ...(names.volume && { volume: { name: names.volume } }), ...(names.tf && { tf: names.tf }) };
+}
+
+/**
+ * Whether a document is of a volume that the master calls `name`. Short addresses may leave the volume
+ * out, or the ending of its name.
+ * @param {any} doc
+ * @param {string} name
+ */
+export function isOfVolume(doc, name) {
+  const meant = doc.volume?.name;
+  return meant === undefined || meant === name || name.startsWith(`${meant}.`);
+}
+
+/**
  * Reads a fragment; null if it holds no document.
  * @param {string} hash
  */
 export async function documentOfFragment(hash) {
-  if (!hash.startsWith("#v1,")) return null;
+  if (!hash.startsWith("#v1,")) return documentOfNames(hash);
   const bytes = await piped(bytesOfBase64url(hash.slice(4)), new Streams.DecompressionStream("deflate-raw"));
   return JSON.parse(new TextDecoder().decode(bytes));
 }

@@ -91,7 +91,7 @@
  * @property {boolean} hounsfield
  * @property {number} nan
  * @property {Preset[]} presets
- * @property {{camera: object, tf: string}} home
+ * @property {{camera: object, tf: string|Tf}} home
  *
  * @typedef {object} Tile  A binary message, taken apart.
  * @property {number} kind

@@ -3,12 +3,13 @@
 //! The scheduler knows workers by id, threads and memory; this table has what it need not know:
 //! links, addresses, names, when each was last heard.
 
+use crate::handle::unix_ms;
 use crate::link::{Caller, WorkerLink};
 use slabcast_common::ids::WorkerId;
 use slabcast_common::message::{Hello, ToMaster, ToWorker};
 use slabcast_common::protocol::{MAX_THREADS, PROTOCOL_VERSIONS, ProtocolVersions};
 use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
-use slabcast_proto::model::Worker;
+use slabcast_proto::model::{Worker, WorkerError};
 use slabcast_schedule::{WorkerIdentity, WorkerView};
 use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
@@ -165,6 +166,8 @@ pub(crate) struct WorkerTable {
     audits: Audits,
     /// Liars, each with the end of its time: what it is, and its address without port.
     shut_out: Vec<(WorkerIdentity, Option<IpAddr>, Instant)>,
+    /// Last failure of each worker, those that are not linked included: who dials again has its own.
+    last_errors: BTreeMap<WorkerIdentity, WorkerError>,
 }
 
 /// Which workers are audited, and for how long those that lied are shut out.
@@ -180,6 +183,12 @@ pub(crate) struct Audits {
 /// Liars that are remembered. The one that came first is forgotten first.
 const MAX_SHUT_OUT: usize = 4096;
 
+/// Workers whose last failure is remembered. The oldest failure is forgotten first.
+const MAX_ERRORS: usize = 4096;
+
+/// Characters that are kept of the reason of a failure.
+const MAX_ERROR: usize = 300;
+
 impl WorkerTable {
     /// A table without workers. Workers give a master up after three times `heartbeat_ms`.
     pub(crate) fn new(rehearses: bool, machine: String, heartbeat_ms: u32, audits: Audits) -> Self {
@@ -191,7 +200,33 @@ impl WorkerTable {
             heartbeat_ms,
             audits,
             shut_out: Vec::new(),
+            last_errors: BTreeMap::new(),
         }
+    }
+
+    /// Notes a failure of a worker, for people. The newest one of each worker is kept.
+    pub(crate) fn note_error(&mut self, worker: WorkerId, reason: &str) {
+        let Some(attached) = self.attached.get(&worker) else { return };
+        let identity = attached.identity.clone();
+        let told: String = reason.chars().take(MAX_ERROR).collect();
+        let reason = told.replace(char::is_control, " ");
+        self.last_errors.insert(identity, WorkerError { at_unix_ms: unix_ms(), reason });
+        if self.last_errors.len() > MAX_ERRORS {
+            let oldest = self.last_errors.iter().min_by_key(|(_, error)| error.at_unix_ms);
+            let oldest = oldest.map(|(identity, _)| identity.clone());
+            self.last_errors.retain(|identity, _| Some(identity) != oldest.as_ref());
+        }
+    }
+
+    /// Returns the newest failure of a worker: what was noted, or a message of its link that was
+    /// damaged.
+    fn last_error(&self, attached: &Attached) -> Option<WorkerError> {
+        let damaged = attached.link.damaged.last_unix_ms().map(|at_unix_ms| WorkerError {
+            at_unix_ms,
+            reason: "a message was damaged on its way, and was sent again".into(),
+        });
+        let noted = self.last_errors.get(&attached.identity).cloned();
+        noted.into_iter().chain(damaged).max_by_key(|error| error.at_unix_ms)
     }
 
     /// Closes the link of a worker that lied, and lets neither it nor others of its address in for a
@@ -273,6 +308,11 @@ impl WorkerTable {
         true
     }
 
+    /// Whether a worker is linked and has not said that it leaves.
+    pub(crate) fn is_staying(&self, worker: WorkerId) -> bool {
+        self.attached.get(&worker).is_some_and(|attached| !attached.leaving)
+    }
+
     /// Closes a worker's link. Returns whether it had said that it leaves; `None` if there is no
     /// such worker.
     pub(crate) fn remove(&mut self, worker: WorkerId) -> Option<bool> {
@@ -325,6 +365,8 @@ impl WorkerTable {
             connected: attached.joined.elapsed(),
             in_reserve: seen.in_reserve,
             damaged_messages: attached.link.damaged.get(),
+            round_trip: seen.round_trip.map(Duration::from_micros),
+            last_error: self.last_error(attached),
         })
     }
 }
@@ -356,6 +398,56 @@ mod tests {
             assert_eq!(other.is_ok(), neighbour, "{address}");
         }
         assert!(admit(&mut table, "liar", "10.0.0.2:5").is_ok(), "somebody else's name");
+    }
+
+    #[test]
+    fn last_error_is_the_newest_and_stays_with_the_worker() {
+        let audits = Audits { everybody: false, nobody: true, shut_out: Duration::from_secs(1) };
+        let mut table = WorkerTable::new(false, "here".into(), 1000, audits);
+        let damaged = crate::link::Damaged::default();
+        let admit = |table: &mut WorkerTable, name: &str| {
+            let link = WorkerLink {
+                control: tokio::sync::mpsc::unbounded_channel().0,
+                bricks: tokio::sync::mpsc::unbounded_channel().0,
+                damaged: damaged.clone(),
+            };
+            let caller = Caller { address: "10.0.0.1:5".into(), is_local: false };
+            table
+                .admit(&Hello { name: name.into(), ..hello() }, caller, link)
+                .expect("let in")
+                .worker
+        };
+        let error = |table: &WorkerTable, id: WorkerId| {
+            let seen = WorkerView {
+                id,
+                name: "w".into(),
+                threads: 2,
+                bricks_held: 0,
+                bytes_held: 0,
+                busy: 0,
+                leases: 0,
+                since: 0,
+                leaving: false,
+                in_reserve: false,
+                round_trip: Some(1500),
+            };
+            let view = table.view(seen).expect("it is linked");
+            assert_eq!(view.round_trip, Some(Duration::from_micros(1500)));
+            view.last_error.map(|error| error.reason)
+        };
+        let first = admit(&mut table, "w");
+        assert_eq!(error(&table, first), None);
+        table.note_error(first, "silent\nfor 3 s");
+        table.remove(first);
+        let (back, other) = (admit(&mut table, "w"), admit(&mut table, "other"));
+        assert_eq!(error(&table, back).as_deref(), Some("silent for 3 s"));
+        assert_eq!(error(&table, other), None, "another worker of the machine");
+        // The test's workers share a link.
+        damaged.add(1);
+        let says = |table: &WorkerTable, id| error(table, id).expect("it is there");
+        assert!(says(&table, other).contains("a message was damaged"));
+        table.note_error(other, &"x".repeat(5000));
+        assert_eq!(table.last_errors.values().map(|e| e.reason.len()).max(), Some(MAX_ERROR));
     }
 
     fn hello() -> Hello {

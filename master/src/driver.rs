@@ -269,6 +269,9 @@ impl Driver {
             Event::Said { worker, message, _place } => self.said(worker, message),
             Event::Detached { worker, reason, is_damage } => {
                 self.refusals.remove(&worker);
+                if self.workers.is_staying(worker) {
+                    self.workers.note_error(worker, &format!("its link ended: {reason}"));
+                }
                 if let Some(is_leaving) = self.workers.remove(worker) {
                     if is_leaving {
                         info!(%worker, "worker left");
@@ -365,6 +368,7 @@ impl Driver {
         let happened = match message {
             ToMaster::Hello(_) => {
                 let reason = "the worker said hello twice".to_string();
+                self.workers.note_error(worker, &reason);
                 self.workers.remove(worker);
                 warn!(%worker, reason, "worker dropped");
                 self.scheduler.handle(&self.clock, Happened::WorkerLost { worker, reason });
@@ -374,6 +378,7 @@ impl Driver {
             ToMaster::Result(result) => Happened::Result { worker, result },
             ToMaster::Failed { task, epoch, reason } => {
                 warn!(%worker, %task, reason, "task failed");
+                self.workers.note_error(worker, &format!("a tile failed: {reason}"));
                 self.note_refusal(worker, (task, epoch), &reason);
                 Happened::Failed { worker, task, epoch, reason }
             }
@@ -381,6 +386,8 @@ impl Driver {
             ToMaster::BricksReceived { set, bricks } => Happened::BricksIn { worker, set, bricks },
             ToMaster::BricksBroken { set, bricks } => {
                 warn!(%worker, bricks = bricks.len(), "bricks damaged in transit, sending them again");
+                let damaged = format!("{} bricks came damaged, and are sent again", bricks.len());
+                self.workers.note_error(worker, &damaged);
                 Happened::BricksBroken { worker, set, bricks }
             }
             ToMaster::BricksWanted { set, bricks } => {

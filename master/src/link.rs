@@ -5,6 +5,7 @@
 //! pointers; the TCP link ([`crate::serve`]) encodes both.
 
 use crate::driver::Event;
+use crate::handle::unix_ms;
 use crate::hooks::Stage;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, WorkerId};
@@ -13,7 +14,7 @@ use slabcast_common::message::{BrickBatch, Hello, ToMaster, ToWorker};
 use slabcast_proto::convert::Bricks;
 use slabcast_volumes::{BrickStore, Problem};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use tokio::sync::{Semaphore, mpsc};
 use tracing::warn;
 
@@ -98,14 +99,16 @@ pub struct WorkerLink {
     pub damaged: Damaged,
 }
 
-/// Number of messages that were damaged on their way over a link, in either direction. The first
-/// one of a link is logged.
+/// Number of messages that were damaged on their way over a link, in either direction, and when the
+/// last one was. The first one of a link is logged.
 #[derive(Clone, Debug, Default)]
 pub struct Damaged(Arc<Counter>);
 
 #[derive(Debug, Default)]
 struct Counter {
     messages: AtomicU64,
+    /// Milliseconds since 1970 UTC.
+    last_unix_ms: AtomicI64,
     worker: String,
     address: String,
 }
@@ -113,12 +116,15 @@ struct Counter {
 impl Damaged {
     /// Counts for a worker by its name and address.
     pub(crate) fn of(worker: String, address: String) -> Damaged {
-        Damaged(Arc::new(Counter { messages: AtomicU64::new(0), worker, address }))
+        Damaged(Arc::new(Counter { worker, address, ..Counter::default() }))
     }
 
     /// Adds `messages`.
     pub(crate) fn add(&self, messages: u64) {
-        let Counter { messages: all, worker, address } = &*self.0;
+        let Counter { messages: all, last_unix_ms, worker, address } = &*self.0;
+        if messages > 0 {
+            last_unix_ms.store(unix_ms(), Ordering::Relaxed);
+        }
         if messages > 0 && all.fetch_add(messages, Ordering::Relaxed) == 0 {
             warn!(
                 worker,
@@ -126,6 +132,11 @@ impl Damaged {
                 "a message was damaged on its way and is sent again; ListWorkers counts more of them"
             );
         }
+    }
+
+    /// Returns when the last message was damaged, in milliseconds since 1970 UTC; `None` if none was.
+    pub(crate) fn last_unix_ms(&self) -> Option<i64> {
+        (self.get() > 0).then(|| self.0.last_unix_ms.load(Ordering::Relaxed))
     }
 
     /// Returns the number of damaged messages.

@@ -221,6 +221,21 @@ pub struct Worker {
     /// Number of messages that were damaged on their way to or from the worker since it joined, and
     /// were sent again.
     pub damaged_messages: u64,
+    /// Round trip of the quickest of the late pings; `None` before the worker answered one.
+    pub round_trip: Option<Duration>,
+    /// The last failure that the master noted for a worker of this name on its machine, over all its
+    /// links.
+    pub last_error: Option<WorkerError>,
+}
+
+/// A failure of a worker: it failed a task, a message of it was damaged, its link ended without a
+/// goodbye, or it was dropped.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WorkerError {
+    /// When the master noted it, in milliseconds since 1970 UTC.
+    pub at_unix_ms: i64,
+    /// For people: what failed, and why.
+    pub reason: String,
 }
 
 /// A piece of a finished frame on its way to a client.

@@ -243,6 +243,24 @@ story("a document and its address give the state back", async () => {
   same(await state.documentOfFragment("#t=secret"), null);
   if ((await state.fragmentOf(state.documentOf(first, volume, [640, 480]))).includes("secret")) throw new Error("a token");
 });
+story("a volume may begin with a function of its own", async () => {
+  const own = tf.fadedBy(skin, 0.5);
+  const first = state.homeState({ ...volume, home: { ...volume.home, tf: own } });
+  same([first.preset, first.tf.opacities], [null, tf.plainTf(own, range).opacities]);
+  const preset = state.stateOfDocument({ version: 1, tf: "auto" }, { ...volume, home: { ...volume.home, tf: own } });
+  same([preset.preset, preset.tf], ["auto", state.homeState(volume).tf]);
+});
+story("a short address names a volume and a preset", async () => {
+  const doc = await state.documentOfFragment("#volume=a%26b%20c%2Bd.nrrd&tf=auto");
+  same(doc, { version: 1, volume: { name: "a&b c+d.nrrd" }, tf: "auto" });
+  same(await state.documentOfFragment("#tf=auto"), { version: 1, tf: "auto" });
+  same(state.isOfVolume(doc, "a&b c+d.nrrd"), true);
+  // As the master finds `head` among its volumes.
+  const short = await state.documentOfFragment("#volume=head");
+  same([state.isOfVolume(short, volume.name), state.isOfVolume(short, "header.nrrd")], [true, false]);
+  same(state.documentOf(state.stateOfDocument(short, volume), volume, [9, 9]), state.documentOf(state.homeState(volume), volume, [9, 9]));
+  for (const other of ["", "#", "#volume", "#panel-colour"]) same(await state.documentOfFragment(other), null, other);
+});
 story("documents of another version or preset are refused in words", () => {
   refused(() => state.stateOfDocument({ version: 2 }, volume), "version");
   refused(() => state.stateOfDocument({ version: 1, tf: "no-such" }, volume), "no-such");

@@ -9,6 +9,7 @@
 //! Results go to stdout, everything else to stderr; every failure is one line
 //! (`slabcast_session::fail`).
 
+mod at_master;
 mod cancel;
 mod command;
 mod compare;

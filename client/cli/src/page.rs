@@ -1,7 +1,7 @@
 //! The page of a master: its flags, and serving it beside gRPC.
 
 use crate::page_files::PageFiles;
-use slabcast_live::{Home, LiveConfig};
+use slabcast_live::{Home, LiveConfig, escaped};
 use slabcast_master::Handle;
 use slabcast_master::serve::serve_with_pages;
 use slabcast_session::fail::Fail;
@@ -27,6 +27,10 @@ pub(crate) struct PageArgs {
     /// File with a token that the page must know; its address then has it
     #[arg(long, value_name = "FILE", hide_short_help = true)]
     page_token: Option<PathBuf>,
+    /// Pages that one address may have open; this machine may have all 64 [default: 16]
+    #[arg(long, value_name = "N", hide_short_help = true,
+          value_parser = clap::value_parser!(u32).range(1..=64))]
+    peer_pages: Option<u32>,
 }
 
 /// Reads a token: one line of printable characters.
@@ -50,6 +54,13 @@ fn token(file: &Path) -> Result<String, Fail> {
 }
 
 impl PageArgs {
+    /// Returns the first of the flags that is given, without its dashes.
+    pub(crate) fn given(&self) -> Option<&'static str> {
+        let host = (!self.allowed_host.is_empty()).then_some("allowed-host");
+        let token = self.page_token.is_some().then_some("page-token");
+        host.or(token).or(self.peer_pages.is_some().then_some("peer-pages"))
+    }
+
     /// Returns the settings of the page.
     ///
     /// # Errors
@@ -61,6 +72,7 @@ impl PageArgs {
             allowed_hosts: self.allowed_host.clone(),
             token: self.page_token.as_deref().map(token).transpose()?,
             home,
+            sessions_of_peer: self.peer_pages.map(|pages| pages as usize),
         })
     }
 }
@@ -84,16 +96,6 @@ pub(crate) fn url(address: SocketAddr, config: &LiveConfig) -> String {
     };
     let token = config.token.as_ref().map(|token| format!("#t={}", escaped(token)));
     format!("http://{host}:{port}/{}", token.unwrap_or_default())
-}
-
-/// Escapes what an address can't hold.
-fn escaped(text: &str) -> String {
-    let escape = |b: u8| match b {
-        b'-' | b'.' | b'_' | b'~' => char::from(b).to_string(),
-        b if b.is_ascii_alphanumeric() => char::from(b).to_string(),
-        b => format!("%{b:02X}"),
-    };
-    text.bytes().map(escape).collect()
 }
 
 /// Serves gRPC and the page on one listener until `stop` turns true.

@@ -138,5 +138,9 @@ fn worker_json(w: &Worker) -> serde_json::Value {
         "held_bytes": w.held_bytes, "held_bricks": w.held_bricks, "tasks_lent": w.tasks_lent,
         "tasks_done": w.tasks_done, "silent_ms": ms(w.silent), "here_ms": ms(w.connected),
         "in_reserve": w.in_reserve, "damaged_messages": w.damaged_messages,
+        "round_trip_ms": w.round_trip.map(|trip| trip.as_secs_f64() * 1e3),
+        "last_error": w.last_error.as_ref().map(|error| {
+            serde_json::json!({"unix_ms": error.at_unix_ms, "reason": error.reason})
+        }),
     })
 }

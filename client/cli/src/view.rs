@@ -1,20 +1,24 @@
 //! `slabcast view`: a page to look at a volume, turn, colour and cut it.
 //!
 //! A master and workers run inside this process, as `render` has them, and serve the page of every
-//! master on a port of this machine until Ctrl-C.
+//! master on a port of this machine until Ctrl-C. With `--master` the page is that master's
+//! ([`there`]).
+
+mod there;
 
 use crate::master::{bind, listen, local, reader};
 use crate::page::{self, PageArgs};
+use slabcast_common::transfer::TransferFunction;
+use slabcast_common::volume::VolumeInfo;
 use slabcast_live::Home;
 use slabcast_master::library::{Source, UploadConfig};
 use slabcast_master::memory::available;
 use slabcast_master::{Library, LibraryConfig};
-use slabcast_scene::presets;
 use slabcast_session::embedded::{Cluster, SHARED, WorkerGroup};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress;
 use slabcast_session::request::AxisArgs;
-use slabcast_session::transfer::NameOrFile;
+use slabcast_session::transfer::{NameOrFile, Transfer};
 use slabcast_session::{parse, runtime, signals, volume};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -31,29 +35,38 @@ const UPLOADS: u64 = 16 << 30;
 Examples:
   slabcast view brain.nii.gz --open
   slabcast view ct.nrrd --tf bone
+  slabcast view ct.nrrd --tf bone.json
   slabcast view head.raw --up=-y
+  On the page of a master, which has the volume or gets it:
+      slabcast view knee --master node1:7433 --open
   On another machine, through a tunnel (ssh -L 7444:127.0.0.1:7444 node):
       slabcast view ct.nrrd --listen 127.0.0.1:7444
 
 The page has the command that draws each of its pictures. A master serves the same page for all of
 its volumes, on its own port (see `slabcast master --help`).")]
 pub(crate) struct ViewArgs {
-    #[arg(help = volume::VOLUME)]
-    volume: PathBuf,
+    #[arg(help = volume::VOLUME, required_unless_present = "master")]
+    volume: Option<PathBuf>,
     #[command(flatten)]
     input: volume::InputArgs,
     #[command(flatten)]
     axes: AxisArgs,
-    /// Preset or colour map of the first picture
-    #[arg(long, value_name = "NAME", default_value = "auto", value_parser = NameOrFile::TRANSFER,
-          hide_possible_values = true)]
-    tf: String,
+    /// Colours of the first picture: a preset, a colour map, or a JSON file of ours or ParaView's
+    /// [default: auto]
+    #[arg(long, value_name = "NAME|FILE", value_parser = NameOrFile::TRANSFER, hide_possible_values = true)]
+    tf: Option<String>,
     /// Open the page in this machine's browser
     #[arg(long)]
     open: bool,
-    /// Address of the page; port 0 takes any free one
-    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:0", value_parser = parse::listen)]
-    listen: String,
+    /// Show a volume on the page of this master: print its address, and end
+    ///
+    /// VOLUME is then a name (`slabcast volumes`), or a file, which is put on the master unless it has it.
+    /// Without VOLUME the page shows the master's own, or its first.
+    #[arg(long, value_name = "HOST:PORT", value_parser = parse::master)]
+    master: Option<String>,
+    /// Address of the page; port 0 takes any free one [default: 127.0.0.1:0]
+    #[arg(long, value_name = "HOST:PORT", value_parser = parse::listen)]
+    listen: Option<String>,
     /// Listen beyond this machine although nothing is encrypted
     #[arg(long, value_parser = clap::builder::FalseyValueParser::new(), hide_short_help = true)]
     insecure: bool,
@@ -71,26 +84,22 @@ pub(crate) struct ViewArgs {
 /// Runs the command.
 pub(crate) fn run(args: &ViewArgs) -> Result<(), Fail> {
     args.axes.orientation()?;
+    if let Some(master) = &args.master {
+        return there::run(args, master);
+    }
+    let Some(volume) = &args.volume else { unreachable!("clap asks for VOLUME without --master") };
     let crew = WorkerGroup::new(args.workers.unwrap_or(1), args.threads)?;
-    let is_known = presets::NAMES.iter().chain(&presets::MAPS).any(|(name, _)| *name == args.tf);
-    if !is_known && Path::new(&args.tf).is_file() {
-        return Err(Fail::usage(format!(
-            "--tf: `{0}` is a file, and a page begins with a preset; give a preset's name, or draw pictures \
-             with `slabcast render --tf {0}`",
-            args.tf
-        )));
-    }
-    if !is_known {
-        return Err(Fail::flag(&presets::unknown_name(&args.tf)));
-    }
-    let file = args.volume.to_string_lossy().into_owned();
-    let home = Home { tf: Some(args.tf.clone()), file: Some(file) };
-    let config = args.page.config(home)?;
+    let transfer = Transfer::read(args.tf.as_deref().unwrap_or("auto"))?;
+    let mut config = args.page.config(Home::default())?;
     let runtime = runtime::start()?;
     // A port in use is told before a large file is read.
-    let socket = runtime.block_on(bind(&args.listen, args.insecure))?;
-    let opened = args.input.open_source(&args.volume)?;
+    let listen_at = args.listen.as_deref().unwrap_or("127.0.0.1:0");
+    let socket = runtime.block_on(bind(listen_at, args.insecure))?;
+    let opened = args.input.open_source(volume)?;
     let orientation = args.axes.for_info(opened.info())?;
+    function(&transfer, opened.info())?;
+    let file = volume.to_string_lossy().into_owned();
+    config.home = Home { tf: Some(transfer.choice(opened.info())), file: Some(file) };
     // Workers share the master's bricks of a volume in memory; of a file both drop what exceeds
     // their memory.
     let brick_bytes = match opened.source.whole(0) {
@@ -101,7 +110,7 @@ pub(crate) fn run(args: &ViewArgs) -> Result<(), Fail> {
     let uploads = tempfile::Builder::new().prefix("slabcast-view-").tempdir();
     let uploads = uploads.map_err(|e| Fail::failed(format!("making a folder failed: {e}")))?;
     let result = runtime.block_on(async {
-        let listener = listen(socket, &args.listen)?;
+        let listener = listen(socket, listen_at)?;
         let address = local(&listener)?;
         let url = page::url(address, &config);
         let library = library(args, (opened.source, orientation), uploads.path())?;
@@ -133,6 +142,17 @@ pub(crate) fn run(args: &ViewArgs) -> Result<(), Fail> {
     });
     runtime::end(runtime);
     result
+}
+
+/// Returns the function of `--tf` in full for a volume.
+///
+/// # Errors
+/// It doesn't fit the volume; a file is named with its field.
+fn function(transfer: &Transfer, info: &VolumeInfo) -> Result<TransferFunction, Fail> {
+    transfer.function(info).map_err(|e| match transfer.file() {
+        Some(file) => Fail::field(file, "transfer function", &e),
+        None => Fail::flag(&e),
+    })
 }
 
 /// Returns the library of the page: the volume that was given, and files that are dropped on the page.

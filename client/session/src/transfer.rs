@@ -118,13 +118,22 @@ impl Transfer {
         Ok(Transfer { base, file, title, preset: None, colours, light, shading, nan })
     }
 
+    /// Returns a preset or colour map by name, or reads a file, as [`Transfer::parse`] does, unchanged
+    /// by flags.
+    ///
+    /// # Errors
+    /// Neither a name nor a file, or a field of the file is wrong.
+    pub fn read(text: &str) -> Result<Self, Fail> {
+        let flags = TransferFlags { colors: None, light: None, shading: None, nan: None };
+        Transfer::parse(text, &flags)
+    }
+
     /// Returns the preset or colour map called `name`, unchanged by flags.
     ///
     /// # Errors
     /// No preset or colour map has that name.
     pub fn from_name(name: &str) -> Result<Self, Fail> {
-        let flags = TransferFlags { colors: None, light: None, shading: None, nan: None };
-        Transfer::parse(name, &flags)
+        Transfer::read(name)
     }
 
     /// Returns a function as a picture records it, with the preset that it came from.

@@ -5,23 +5,30 @@
 //! - `slot` decides which pass a session draws next, `preview` how coarsely it moves; both are pure.
 //! - `session` is one page: it reads, draws, encodes and writes. `picture` draws one pass as a job of
 //!   one frame of the master, `tile` encodes it.
-//! - `volume` describes a volume for an editor, `news` tells of jobs, workers and volumes.
+//! - `volume` describes a volume for an editor, `descriptions` keeps what was described,
+//!   `gradients` counts slopes, `news` tells of jobs, workers and volumes.
+//! - `address` writes the fragments of the page's address.
+//! - `places` counts sessions, `write_limit` gives up connections that nobody reads.
 //! - `guard` knows who may call, `http` and `uploads` have the calls beside the socket, `assets` the page's
 //!   files. [`Files`] writes what people keep; the program brings it.
 //!
 //! Nothing here draws: workers do. Nothing slow runs on the runtime's threads: reading and encoding
 //! have threads of their own.
 
+mod address;
 mod assets;
 mod blocks;
 mod compare;
+mod descriptions;
 mod files;
+mod gradients;
 mod guard;
 mod http;
 mod messages;
 mod news;
 mod pick;
 mod picture;
+mod places;
 mod preview;
 mod problem;
 mod server;
@@ -31,7 +38,9 @@ mod slot;
 mod tile;
 mod uploads;
 mod volume;
+mod write_limit;
 
+pub use address::{escaped, fragment};
 pub use files::{Files, MadeFile, Making, Recipe};
 pub use server::serve;
 pub use shared::LiveConfig;

@@ -164,6 +164,9 @@ fn worker_entry(worker: &Worker, now_ms: u64) -> Value {
     // Rounded: the second in which it joined does not change.
     let joined_ms =
         (now_ms.saturating_sub(worker.connected.as_millis() as u64) + 500) / 1000 * 1000;
+    let rtt_ms = worker.round_trip.map(|trip| (trip.as_micros() as f64 / 10.0).round() / 100.0);
+    let told = worker.last_error.as_ref();
+    let last_error = told.map(|error| json!({"at_ms": error.at_unix_ms, "text": error.reason}));
     json!({
         "worker": format!("w{}", worker.id.0), "name": worker.name, "address": worker.address,
         "threads": worker.threads, "busy": worker.tasks_lent.min(worker.threads),
@@ -171,8 +174,8 @@ fn worker_entry(worker: &Worker, now_ms: u64) -> Value {
         "held_bytes": worker.held_bytes, "tasks_lent": worker.tasks_lent,
         "tasks_done": worker.tasks_done,
         "silent_ms": worker.silent.as_millis() as u64 / 1000 * 1000,
-        "joined_ms": joined_ms, "in_reserve": worker.in_reserve, "rtt_ms": null,
-        "damaged": worker.damaged_messages, "last_error": null,
+        "joined_ms": joined_ms, "in_reserve": worker.in_reserve, "rtt_ms": rtt_ms,
+        "damaged": worker.damaged_messages, "last_error": last_error,
     })
 }
 

@@ -8,7 +8,8 @@ use crate::files::Files;
 use crate::http;
 use crate::problem::Problem;
 use crate::session;
-use crate::shared::{LiveConfig, SESSIONS, Shared};
+use crate::shared::{LiveConfig, Shared};
+use crate::write_limit::WriteLimit;
 use axum::body::{Body, to_bytes};
 use axum::extract::FromRequestParts;
 use axum::extract::ws::WebSocketUpgrade;
@@ -43,6 +44,9 @@ const CONNECTIONS: usize = 512;
 /// keeps its place, so no address may take all.
 const CONNECTIONS_OF_PEER: usize = 128;
 
+/// Time after which a connection whose client takes no byte of an answer is given up.
+const STUCK: Duration = Duration::from_secs(60);
+
 /// Bytes of a request's head.
 const HEAD_BYTES: usize = 32 << 10;
 
@@ -52,6 +56,10 @@ const GOODBYE: Duration = Duration::from_secs(2);
 /// Bytes of the longest message that is read at all: of one that is too long the session tells, and only
 /// of one that was read can it.
 const SOCKET_BYTES: usize = 2 << 20;
+
+/// Bytes that are read from a socket at a time. Each session holds so many; messages of a hand that
+/// moves have 200, and longer ones come in pieces.
+const READ_BYTES: usize = 4 << 10;
 
 /// An answer, or a refusal.
 pub(crate) type Answer = Result<Response, Problem>;
@@ -66,6 +74,7 @@ pub async fn serve(
     mut stop: watch::Receiver<bool>,
 ) {
     let shared = Arc::new(Shared::new(handle, config, files, stop.clone()));
+    tokio::spawn(session::prepare(shared.clone()));
     let mut of_peers: BTreeMap<IpAddr, usize> = BTreeMap::new();
     let mut open = JoinSet::new();
     loop {
@@ -100,8 +109,7 @@ pub async fn serve(
     let ended = async { while open.join_next().await.is_some() {} };
     let _ = tokio::time::timeout(GOODBYE, ended).await;
     // Sessions say goodbye.
-    let all = shared.sessions.acquire_many(SESSIONS as u32);
-    let _ = tokio::time::timeout(GOODBYE, all).await;
+    let _ = tokio::time::timeout(GOODBYE, shared.sessions.all_free()).await;
 }
 
 /// Answers the requests of one connection.
@@ -115,7 +123,7 @@ async fn talk(shared: Arc<Shared>, connection: PageConnection, mut stop: watch::
         .timer(TokioTimer::new())
         .header_read_timeout(HEAD)
         .max_buf_size(HEAD_BYTES.max(64 << 10))
-        .serve_connection(TokioIo::new(connection), service)
+        .serve_connection(TokioIo::new(WriteLimit::new(connection, STUCK)), service)
         .with_upgrades();
     let mut talking = std::pin::pin!(talking);
     let ended = tokio::select! {
@@ -258,6 +266,7 @@ async fn upgrade(shared: Arc<Shared>, caller: Caller, request: Request<Body>) ->
     let upgrade = upgrade
         .max_message_size(SOCKET_BYTES)
         .max_frame_size(SOCKET_BYTES)
+        .read_buffer_size(READ_BYTES)
         .write_buffer_size(0)
         .max_write_buffer_size(8 << 20);
     let peer = Some(caller.peer.ip());

@@ -1,7 +1,9 @@
 //! State shared by all sessions and HTTP calls of a master's page.
 
+use crate::descriptions::Descriptions;
 use crate::files::Files;
 use crate::guard::Guard;
+use crate::places::Places;
 use crate::volume::Home;
 use slabcast_master::Handle;
 use std::sync::Arc;
@@ -13,8 +15,8 @@ use tokio::sync::{Semaphore, watch};
 pub(crate) const LIVE_EDGE: u32 = 4096;
 /// Most pixels of a live picture.
 pub(crate) const LIVE_PIXELS: u64 = 4 << 20;
-/// Sessions at a time.
-pub(crate) const SESSIONS: usize = 64;
+/// Sessions of one address unless the settings say otherwise.
+const SESSIONS_OF_PEER: usize = 16;
 
 /// Pictures to keep that are made at a time: one of 8192x8192 takes 0.5 GiB.
 const PICTURES: usize = 4;
@@ -32,6 +34,8 @@ pub struct LiveConfig {
     pub token: Option<String>,
     /// Scene of the first picture.
     pub home: Home,
+    /// Sessions that one address other than this machine's may have at a time; default 16.
+    pub sessions_of_peer: Option<usize>,
 }
 
 /// See the head of the file.
@@ -39,7 +43,7 @@ pub(crate) struct Shared {
     pub(crate) handle: Handle,
     pub(crate) config: LiveConfig,
     pub(crate) guard: Guard,
-    pub(crate) sessions: Arc<Semaphore>,
+    pub(crate) sessions: Places,
     /// Places of pictures to keep that are drawn and written now.
     pub(crate) pictures: Semaphore,
     pub(crate) stop: watch::Receiver<bool>,
@@ -47,6 +51,7 @@ pub(crate) struct Shared {
     pub(crate) states: crate::http::States,
     pub(crate) results: crate::http::Results,
     pub(crate) uploads: crate::uploads::Uploads,
+    pub(crate) descriptions: Descriptions,
     started: Instant,
     last_id: AtomicU64,
 }
@@ -61,14 +66,15 @@ impl Shared {
         Shared {
             guard: Guard::new(&config.machine, &config.allowed_hosts, config.token.as_deref()),
             handle,
+            sessions: Places::new(config.sessions_of_peer.unwrap_or(SESSIONS_OF_PEER)),
             config,
-            sessions: Arc::new(Semaphore::new(SESSIONS)),
             pictures: Semaphore::new(PICTURES),
             stop,
             files,
             states: Default::default(),
             results: Default::default(),
             uploads: Default::default(),
+            descriptions: Default::default(),
             started: Instant::now(),
             last_id: AtomicU64::new(0),
         }

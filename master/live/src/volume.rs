@@ -1,5 +1,7 @@
 //! The message `volume`: all that an editor needs, and the home view.
 
+use crate::descriptions::{Described, Descriptions};
+use crate::gradients::{Gradients, gradients};
 use crate::problem::Problem;
 use serde_json::{Value, json};
 use slabcast_common::quality::Compositing;
@@ -11,23 +13,20 @@ use slabcast_scene::path::{Fit, Framing, Key, KeyFrames, Orientation, ViewPath};
 use slabcast_scene::presets::{self, Levels};
 use slabcast_scene::request::VolumeChoice;
 use slabcast_scene::transfer::TransferChoice;
-use slabcast_scene::values::in_values;
+use slabcast_scene::values::{as_read_from_file, in_values};
 use slabcast_volumes::framing::framing_of;
 use std::sync::Arc;
 
 /// Azimuth of the home view in degrees: where `slabcast render` begins.
 const HOME_AZIMUTH: f64 = 20.0;
 
-/// A volume that a session shows.
-#[derive(Clone)]
+/// A volume that sessions show.
 pub(crate) struct Shown {
     pub(crate) served: Arc<ServedVolume>,
     /// Whether stills are drawn at the level that fits: a file too large for memory.
     pub(crate) is_large: bool,
     pub(crate) home: Key,
     pub(crate) home_tf: TransferChoice,
-    /// The message.
-    pub(crate) message: Arc<Value>,
 }
 
 impl Shown {
@@ -87,10 +86,15 @@ fn presets_of(info: &VolumeInfo) -> Vec<Value> {
     let fitted = named.chain(maps).filter_map(|((name, words), is_map)| {
         let tf = presets::by_name(name, &info.summary).ok()?;
         let share = visible_share(&tf, info);
-        let tf: Value = serde_json::from_str(&in_values(&tf, info).to_json()).ok()?;
+        let tf = told(&tf, info);
         Some(json!({"name": name, "for": words, "share": share, "map": is_map, "tf": tf}))
     });
     fitted.collect()
+}
+
+/// Returns a function as messages tell it: over the values of the file.
+fn told(tf: &TransferFunction, info: &VolumeInfo) -> Value {
+    serde_json::to_value(in_values(tf, info)).unwrap_or_default()
 }
 
 /// Returns a choice's function in full.
@@ -152,29 +156,99 @@ fn rounded(x: f64, decimals: i32) -> f64 {
 /// Scene that a page shows first.
 #[derive(Clone, Debug, Default)]
 pub struct Home {
-    /// Preset of the first picture; default `auto`.
-    pub tf: Option<String>,
-    /// Path that command lines give for the volume; `None`: its name.
+    /// Preset or function of the first picture; default `auto`. A preset is that of all volumes, a
+    /// function that of the volume with which the master was started: others begin with `auto`.
+    pub tf: Option<TransferChoice>,
+    /// Path that command lines give for the volume with which the master was started; `None`: its name.
     pub file: Option<String>,
 }
 
-/// Describes an open volume for a picture of `size`. Takes a tenth of a second: what can be seen is
-/// looked for.
+impl Home {
+    /// Returns the scene of another volume than that with which the master was started.
+    pub(crate) fn of_another(&self) -> Home {
+        let preset = self.tf.clone().filter(|tf| matches!(tf, TransferChoice::Name(_)));
+        Home { tf: preset, file: None }
+    }
+}
+
+/// What the message `volume` says of a volume for pictures of every size: text of a JSON object.
+pub(crate) struct Facts(String);
+
+/// Finds the facts of an open volume.
+fn facts(open: &OpenVolume) -> Facts {
+    let served = &open.served;
+    let info = &served.info;
+    let (summary, lattice) = (&info.summary, &info.lattice);
+    let Orientation { up, front } = served.orientation;
+    let (from, to, counts) = histogram(info);
+    let (lowest, highest) = summary.range();
+    let (core_from, core_to) = summary.core_range();
+    let kind = serde_json::to_value(summary.kind).unwrap_or_default();
+    let gradients = open.source.whole(open.level).and_then(gradients);
+    let fields = json!({
+        "digest": info.digest.to_string(),
+        "dims": lattice.dims,
+        "steps": lattice.steps.map(|v| v.to_array()),
+        "box": world_box(lattice),
+        "unit": if served.anatomical { "mm" } else { "" },
+        "anatomical": served.anatomical,
+        "up": up.to_string(),
+        "front": front.to_string(),
+        "sample_kind": kind,
+        "range": [lowest, highest],
+        "core": [core_from, core_to],
+        "histogram": {"from": from, "to": to, "counts": counts},
+        "gradients": gradients.map(|Gradients { to, counts }| json!({"to": to, "counts": counts})),
+        "hounsfield": Levels::from_summary(summary).water.is_some(),
+        "nan": summary.nan,
+        "presets": presets_of(info),
+    });
+    Facts(fields.to_string())
+}
+
+/// Returns the text of an object with the fields of two, neither of which is empty.
+fn joined(a: &Value, b: &str) -> String {
+    let mut text = a.to_string();
+    text.pop();
+    text.push(',');
+    text.push_str(b.strip_prefix('{').unwrap_or(b));
+    text
+}
+
+/// Returns the description of an open volume for a picture of `size`. The first of a volume and size
+/// takes a tenth of a second: what can be seen is looked for.
 ///
 /// # Errors
 /// The volume's file can't be read, or no camera fits it.
 pub(crate) fn describe(
+    known: &Descriptions,
     open: &OpenVolume,
-    name: String,
+    name: &str,
     size: [u32; 2],
     home: &Home,
-) -> Result<Shown, Problem> {
+) -> Result<Described, Problem> {
+    known.get(&open.served, name, size, || {
+        let facts = known.facts(&open.served, || facts(open));
+        describe_anew(open, name, size, home, &facts)
+    })
+}
+
+fn describe_anew(
+    open: &OpenVolume,
+    name: &str,
+    size: [u32; 2],
+    home: &Home,
+    facts: &Facts,
+) -> Result<Described, Problem> {
     let served = &open.served;
     let info = &served.info;
-    let (summary, lattice) = (&info.summary, &info.lattice);
-    let preset = home.tf.as_deref().unwrap_or("auto");
-    let tf = presets::by_name(preset, summary).map_err(|e| Problem::field(&e))?;
-    let Orientation { up, front } = served.orientation;
+    let lattice = &info.lattice;
+    let home_tf = home.tf.clone().unwrap_or_else(|| TransferChoice::Name("auto".into()));
+    let tf = function(&as_read_from_file(home_tf.clone(), info), info)?;
+    let told_tf = match &home_tf {
+        TransferChoice::Name(preset) => preset.as_str().into(),
+        TransferChoice::Function(tf) => told(tf, info),
+    };
     let key = Key { azimuth: Some(HOME_AZIMUTH), elevation: Some(0.0), ..Key::default() };
     let keyframes = KeyFrames {
         frames: 1,
@@ -197,44 +271,50 @@ pub(crate) fn describe(
     let target = target.map(short);
     let height = if short(height) > 0.0 { short(height) } else { height };
     let camera = Key { target: Some(target), height: Some(height), ..key };
-    let (from, to, counts) = histogram(info);
-    let (lowest, highest) = summary.range();
-    let (core_from, core_to) = summary.core_range();
-    let kind = serde_json::to_value(summary.kind).unwrap_or_default();
-    let message = json!({
+    let own = json!({
         "type": "volume",
         "name": name,
-        "digest": info.digest.to_string(),
-        "file": home.file.clone().unwrap_or_else(|| name.clone()),
-        "dims": lattice.dims,
-        "steps": lattice.steps.map(|v| v.to_array()),
-        "box": [lo, hi],
-        "unit": if served.anatomical { "mm" } else { "" },
-        "anatomical": served.anatomical,
-        "up": up.to_string(),
-        "front": front.to_string(),
-        "sample_kind": kind,
-        "range": [lowest, highest],
-        "core": [core_from, core_to],
-        "histogram": {"from": from, "to": to, "counts": counts},
-        "gradients": null,
-        "hounsfield": Levels::from_summary(summary).water.is_some(),
-        "nan": summary.nan,
-        "presets": presets_of(info),
-        "home": {"camera": camera, "tf": preset},
+        "file": home.file.as_deref().unwrap_or(name),
+        "home": {"camera": camera, "tf": told_tf},
     });
-    Ok(Shown {
+    let shown = Shown {
         served: served.clone(),
         is_large: open.source.whole(open.level).is_none(),
         home: camera,
-        home_tf: TransferChoice::Name(preset.into()),
-        message: Arc::new(message),
-    })
+        home_tf,
+    };
+    Ok(Described { shown: Arc::new(shown), message: joined(&own, &facts.0).into() })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use slabcast_common::volume::Volume;
+    use slabcast_master::Library;
+    use slabcast_master::library::Viewer;
+
+    #[test]
+    fn pages_of_one_size_share_a_description() {
+        let ball = Volume::from_fn_u8("ball", [16; 3], |i, j, k| (i * j * k / 16) as u8);
+        let library = Library::of(ball, Orientation::new(None, None).expect("defaults"));
+        let open = library.open(&VolumeChoice::Default, Viewer::own()).expect("it is there");
+        let known = Descriptions::default();
+        let home = Home::default();
+        let of = |size| describe(&known, &open, "ball", size, &home).expect("it fits");
+        let (one, same, wide) = (of([64, 64]), of([64, 64]), of([128, 64]));
+        assert!(Arc::ptr_eq(&one.shown, &same.shown));
+        assert_eq!(one.message.as_ptr(), same.message.as_ptr(), "the same bytes");
+        assert!(!Arc::ptr_eq(&one.shown, &wide.shown), "another picture is framed anew");
+        let message: Value = serde_json::from_str(&one.message).expect("JSON");
+        assert_eq!((&message["type"], &message["name"]), (&json!("volume"), &json!("ball")));
+        assert_eq!(
+            (&message["dims"], &message["home"]["tf"]),
+            (&json!([16, 16, 16]), &json!("auto"))
+        );
+        assert_eq!(message["presets"][0]["name"], "auto");
+        let counts = message["gradients"]["counts"].as_array().expect("a histogram");
+        assert_eq!((counts.len(), message["gradients"]["to"].as_f64() > Some(0.0)), (64, true));
+    }
 
     #[test]
     fn home_views_have_short_numbers() {

@@ -721,6 +721,7 @@ impl Scheduler {
                 since: w.since,
                 leaving: w.leaving,
                 in_reserve: self.cluster.roster.has_in_reserve(id),
+                round_trip: w.round_trip(),
             }
         };
         self.cluster.roster.iter().map(view).collect()

@@ -70,6 +70,7 @@ impl Driver {
                     }
                 }
                 Action::Drop { worker, reason } => {
+                    self.workers.note_error(worker, &format!("it was dropped: {reason}"));
                     if self.workers.remove(worker).is_some() {
                         warn!(%worker, reason, "worker dropped");
                     }

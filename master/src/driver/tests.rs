@@ -665,6 +665,29 @@ async fn job_whose_worker_refuses_tiles_says_that_and_not_that_others_come_first
     is_sick.store(0, Ordering::Relaxed);
     assert_eq!(watched(&handle, job).await, (JobState::Done, 1));
     assert!(!said().message.contains("refused"), "{}", said().message);
+    let worker = &handle.workers().await[0];
+    let error = worker.last_error.as_ref().expect("it failed tiles");
+    assert_eq!(error.reason, "a tile failed: out of  [31mmemory");
+    assert!(error.at_unix_ms > 0 && worker.round_trip.is_some(), "it answered pings");
+    master.shutdown().await;
+}
+
+#[tokio::test]
+async fn worker_that_comes_back_has_the_error_by_which_it_went() {
+    let master = master(Hooks::default(), 1_000_000);
+    let handle = master.handle();
+    join(&handle, Arc::default());
+    until_workers(&handle, 1).await;
+    let first = handle.workers().await.remove(0);
+    assert_eq!(first.last_error, None);
+    handle.detach(first.id, "the cable was pulled".into(), true).await;
+    until_workers(&handle, 0).await;
+    join(&handle, Arc::default());
+    until_workers(&handle, 1).await;
+    let second = handle.workers().await.remove(0);
+    assert_ne!(second.id, first.id);
+    let error = second.last_error.expect("it was lost");
+    assert_eq!(error.reason, "its link ended: the cable was pulled");
     master.shutdown().await;
 }
 

@@ -352,6 +352,11 @@ pub fn worker() -> impl Strategy<Value = model::Worker> {
         connected: Duration::from_nanos(n[6]),
         in_reserve: m[0] % 2 == 1,
         damaged_messages: m[0].into(),
+        round_trip: (m[0] % 3 > 0).then(|| Duration::from_nanos(n[5])),
+        last_error: (m[0] % 5 > 0).then(|| model::WorkerError {
+            at_unix_ms: i64::from(m[1]),
+            reason: "tile failed: out of memory".into(),
+        }),
     })
 }
 

@@ -10,13 +10,13 @@ mod quality;
 mod run;
 mod trace;
 
+use crate::at_master::{self, VolumeWords, is_here};
 use debug_views::DebugView;
 use quality::{choose_here, choose_there};
 use run::Run;
 use slabcast_client::{Client, VolumeDescription};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_scene::path::{MAX_FRAMES, Orientation};
-use slabcast_scene::request::VolumeChoice;
 use slabcast_session::embedded::{self, Cluster, WorkerGroup};
 use slabcast_session::fail::Fail;
 use slabcast_session::output::{DiskWait, Format, Lines, Output, OutputArgs};
@@ -254,7 +254,13 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             let mut run = run;
             run.progress.phase(&format!("dialling {master}"));
             let client = runtime.block_on(remote::connect(&master))?;
-            let served = served(args, &mut run, &client, &runtime)?;
+            let words = VolumeWords {
+                volume: args.volume.as_deref(),
+                input: &args.input,
+                axes: &args.scene.view.axes,
+                quiet: args.quiet,
+            };
+            let served = at_master::volume(&words, &client, &runtime, &mut run.progress)?;
             if !run.request.target.is_empty() {
                 choose_there(&mut run, &client, &served, &master, &runtime, args.quiet)?;
             }
@@ -264,57 +270,6 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     };
     runtime::end(runtime);
     result
-}
-
-/// Returns whether VOLUME means a file, a folder or a formula of this machine, and not a volume of
-/// the master by name. Names have no `/`, so a path to a missing file is reported as one.
-fn is_here(volume: &Path) -> bool {
-    let text = volume.to_string_lossy();
-    volume.exists() || text.contains('/') || text.starts_with("formula:")
-}
-
-/// Returns the volume at the master that the command means. A file is read here, and put there
-/// unless the master has it.
-fn served(
-    args: &RenderArgs,
-    run: &mut Run,
-    client: &Client,
-    runtime: &tokio::runtime::Runtime,
-) -> Result<VolumeDescription, Fail> {
-    let Some(volume) = &args.volume else {
-        return runtime.block_on(remote::describe(client, &VolumeChoice::Default));
-    };
-    if !is_here(volume) {
-        let name = volume.to_string_lossy().into_owned();
-        return runtime.block_on(remote::describe(client, &VolumeChoice::Name(name)));
-    }
-    run.progress.phase(&format!("reading {}", volume.display()));
-    let volume = args.input.open(volume)?;
-    let orientation = args.scene.view.axes.for_volume(&volume)?;
-    let name = (volume.name.as_str(), false);
-    // Nothing is sent and no progress is shown if the master has the volume already.
-    let mut sending = None;
-    let told = |there, total| {
-        if there < total || sending.is_some() {
-            let bar = sending.get_or_insert_with(|| Progress::new(args.quiet).counting("MiB"));
-            bar.bytes_done(
-                there,
-                total,
-                &format!("sending {} to {}", volume.name, client.address()),
-            );
-        }
-    };
-    let put = runtime.block_on(async {
-        signals::listen();
-        tokio::select! {
-            put = remote::put(client, &volume, orientation, name, told) => put,
-            code = signals::stopped() => Err(Fail::silent(code)),
-        }
-    });
-    if let Some(bar) = sending {
-        bar.end();
-    }
-    put
 }
 
 /// The turn that is drawn where no flag says it: a full one in a folder, its first picture in a

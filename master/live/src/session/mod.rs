@@ -8,6 +8,7 @@ mod asks;
 mod passes;
 mod thumbs;
 
+use crate::descriptions::Described;
 use crate::messages::{Ack, Head, Hello, LONGEST, Open, Ping, Scene, View, WatchAsk};
 use crate::picture::{Drawn, Early, check_size};
 use crate::preview::Preview;
@@ -38,9 +39,6 @@ const HELLO: Duration = Duration::from_secs(5);
 
 /// Interval of WebSocket pings.
 const PING: Duration = Duration::from_secs(20);
-
-/// Time after which a socket that takes no byte is given up.
-const STUCK: Duration = Duration::from_secs(60);
 
 /// Time for a client to take the close code and close.
 const FAREWELL: Duration = Duration::from_secs(1);
@@ -81,7 +79,7 @@ struct End(u16, String);
 /// Result of a task that a session started.
 pub(super) enum Outcome {
     /// A volume was opened, or not.
-    Opened { open: Box<Opening>, result: Result<Option<Box<Shown>>, Problem> },
+    Opened { open: Box<Opening>, result: Result<Option<Described>, Problem> },
     /// A pass was drawn. `number`: which.
     Drawn { number: u64, result: Result<Box<Drawn>, Problem> },
     /// The present state of what is watched.
@@ -169,11 +167,14 @@ pub(super) fn text(value: &Value) -> Message {
 
 /// Runs a session until either side closes.
 pub(crate) async fn run(shared: Arc<Shared>, socket: WebSocket, peer: Option<IpAddr>) {
-    let Ok(_place) = shared.sessions.clone().try_acquire_owned() else {
-        let mut socket = socket;
-        let reason = "as many sessions as this master takes; dial again later".into();
-        let _ = socket.send(Message::Close(Some(CloseFrame { code: code::FULL, reason }))).await;
-        return;
+    let _place = match shared.sessions.take(peer) {
+        Ok(place) => place,
+        Err(words) => {
+            let mut socket = socket;
+            let close = CloseFrame { code: code::FULL, reason: words.into() };
+            let _ = socket.send(Message::Close(Some(close))).await;
+            return;
+        }
     };
     let (sink, mut stream) = socket.split();
     let (to_writer, from_session) = mpsc::channel(WRITING);
@@ -214,8 +215,9 @@ async fn write(mut sink: SplitSink<WebSocket, Message>, mut messages: mpsc::Rece
         };
         let Some(message) = message else { break };
         let is_last = matches!(message, Message::Close(_));
-        match tokio::time::timeout(STUCK, sink.send(message)).await {
-            Ok(Ok(())) if !is_last => {}
+        // A client that takes no byte for a minute loses its connection (`write_limit`).
+        match sink.send(message).await {
+            Ok(()) if !is_last => {}
             _ => return,
         }
     }
@@ -441,7 +443,7 @@ impl Session {
         let (shared, viewer, size) = (self.shared.clone(), self.viewer, self.size);
         self.tasks.spawn(async move {
             let result = opened(&shared, open.name.clone(), viewer, size).await;
-            Outcome::Opened { open, result: result.map(|shown| shown.map(Box::new)) }
+            Outcome::Opened { open, result }
         });
     }
 
@@ -451,7 +453,7 @@ impl Session {
             Outcome::Opened { open, result } => {
                 self.opening = None;
                 match result {
-                    Ok(Some(shown)) => self.show(*shown, *open),
+                    Ok(Some(described)) => self.show(described, *open),
                     // A master without volumes waits for the first.
                     Ok(None) => {}
                     Err(problem) => {
@@ -530,7 +532,8 @@ impl Session {
     }
 
     /// Shows a volume that was opened.
-    fn show(&mut self, shown: Shown, open: Opening) {
+    fn show(&mut self, described: Described, open: Opening) {
+        let Described { shown, message } = described;
         let Opening { hello, id, then: First { view, scene }, .. } = open;
         self.drop_pass();
         self.drop_thumb();
@@ -538,8 +541,7 @@ impl Session {
         self.preview = Preview::default();
         self.previewed = None;
         self.frame = None;
-        self.say(&shown.message);
-        let shown = Arc::new(shown);
+        self.send(Some(Message::Text(message)));
         self.shown = Some(shown.clone());
         let re = if hello { "hello" } else { "open" };
         // The home view has the numbers of the latest view and scene.
@@ -706,6 +708,21 @@ pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, Problem> {
     serde_json::from_str(text).map_err(|e| Problem::json(&e))
 }
 
+/// Size of the pictures for which a master describes its own volume at its start: a page beside its
+/// panel on a usual screen. Pictures of another size share the most of it.
+const USUAL_SIZE: [u32; 2] = [1280, 960];
+
+/// Describes the volume of `slabcast view`, so that the first page needn't wait for it. Of another
+/// master nobody may ever ask for the page.
+pub(crate) async fn prepare(shared: Arc<Shared>) {
+    if shared.config.home.file.is_none() {
+        return;
+    }
+    if let Err(problem) = opened(&shared, None, Viewer::own(), USUAL_SIZE).await {
+        debug!(problem = problem.problem, "the volume can't be described yet");
+    }
+}
+
 /// Opens a volume and describes it, on a blocking thread. Without a name: the master's own, or its first
 /// that can be read; `None` if there is none.
 async fn opened(
@@ -713,8 +730,8 @@ async fn opened(
     name: Option<String>,
     viewer: Viewer,
     size: [u32; 2],
-) -> Result<Option<Shown>, Problem> {
-    let home = shared.config.home.clone();
+) -> Result<Option<Described>, Problem> {
+    let of_page = shared.clone();
     let described = shared.handle.reading(move |library| {
         let choice = match name {
             Some(name) => VolumeChoice::Name(name),
@@ -728,8 +745,12 @@ async fn opened(
             }
         };
         let open = library.open(&choice, viewer)?;
-        let name = library.name_of(open.served.info.digest, viewer);
-        describe(&open, name, size, &home).map(Some)
+        let digest = open.served.info.digest;
+        let name = library.name_of(digest, viewer);
+        let is_own = library.default_volume().is_some_and(|own| own.info.digest == digest);
+        let home = &of_page.config.home;
+        let home = if is_own { home.clone() } else { home.of_another() };
+        describe(&of_page.descriptions, &open, &name, size, &home).map(Some)
     });
     described.await.ok_or_else(Problem::ending)?
 }

@@ -165,6 +165,11 @@ impl Worker {
         self.leases < u64::from(self.threads)
     }
 
+    /// Returns the round trip of the quickest of the late pings; `None` before the first pong.
+    pub(crate) fn round_trip(&self) -> Option<Micros> {
+        Some(2 * self.offset?.half_rtt)
+    }
+
     /// Maps a time on the worker's clock to the master's; `None` before the first pong.
     pub(crate) fn to_master(&self, worker_us: u64) -> Option<Micros> {
         let o = self.offset?;
@@ -589,6 +594,7 @@ mod tests {
         let w = WorkerId(1);
         r.join(w, newcomer("a", 1), 0);
         assert_eq!(r.get(w).unwrap().to_master(5), None);
+        assert_eq!(r.get(w).unwrap().round_trip(), None);
         // The worker's clock is 1,000,000 ahead. A slow, lopsided pong first.
         let n = r.ping(w, 100);
         assert!(r.pong(w, n, 1_000_000 + 100, 5100));
@@ -596,6 +602,7 @@ mod tests {
         let n = r.ping(w, 6000);
         assert!(r.pong(w, n, 1_000_000 + 6050, 6100));
         assert_eq!(r.get(w).unwrap().to_master(1_010_000), Some(10_000));
+        assert_eq!(r.get(w).unwrap().round_trip(), Some(100));
         let n = r.ping(w, 7000);
         assert!(r.pong(w, n, 1_000_000 + 7000, 9000));
         assert_eq!(r.get(w).unwrap().to_master(1_010_000), Some(10_000));

@@ -8,7 +8,7 @@ use crate::convert::{
     MAX_NAME, WireError, digest_from_wire, name_from_wire, optional_name_from_wire,
     reason_from_wire, reason_to_wire,
 };
-use crate::model::{Job, Worker};
+use crate::model::{Job, Worker, WorkerError};
 use bytes::Bytes;
 use prost_types::{Duration as WireDuration, Timestamp};
 use slabcast_common::ids::WorkerId;
@@ -153,7 +153,19 @@ pub fn worker_to_wire(worker: &Worker) -> wire::Worker {
         connected_duration: duration_to_wire(worker.connected),
         in_reserve: worker.in_reserve,
         damaged_messages: worker.damaged_messages,
+        round_trip_duration: worker.round_trip.and_then(duration_to_wire),
+        last_error: worker.last_error.as_ref().map(|error| wire::WorkerError {
+            time: time_to_wire(error.at_unix_ms),
+            reason: reason_to_wire(&error.reason),
+        }),
     }
+}
+
+fn error_from_wire(error: wire::WorkerError) -> Result<WorkerError, WireError> {
+    Ok(WorkerError {
+        at_unix_ms: time_from_wire("time", error.time)?,
+        reason: reason_from_wire("reason", error.reason)?,
+    })
 }
 
 /// Converts a worker from the message that clients get.
@@ -177,6 +189,15 @@ pub fn worker_from_wire(worker: wire::Worker) -> Result<Worker, WireError> {
         connected: duration_from_wire("connected_duration", worker.connected_duration)?,
         in_reserve: worker.in_reserve,
         damaged_messages: worker.damaged_messages,
+        round_trip: worker
+            .round_trip_duration
+            .map(|duration| duration_from_wire("round_trip_duration", Some(duration)))
+            .transpose()?,
+        last_error: worker
+            .last_error
+            .map(error_from_wire)
+            .transpose()
+            .map_err(|e| e.within("last_error"))?,
     })
 }
 

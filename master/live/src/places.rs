@@ -19,16 +19,19 @@ const SHARE_TAKEN: &str =
 pub(crate) struct Places {
     all: Arc<Semaphore>,
     most_of_peer: usize,
-    of_peers: Arc<Mutex<BTreeMap<IpAddr, usize>>>,
+    of_peers: Arc<Mutex<Counts>>,
 }
+
+/// Sessions of each address that has any.
+type Counts = BTreeMap<IpAddr, usize>;
 
 /// The place of one session, free again when it is dropped.
 pub(crate) struct Place {
     _one: OwnedSemaphorePermit,
-    peer: Option<(IpAddr, Arc<Mutex<BTreeMap<IpAddr, usize>>>)>,
+    peer: Option<(IpAddr, Arc<Mutex<Counts>>)>,
 }
 
-fn lock(of_peers: &Mutex<BTreeMap<IpAddr, usize>>) -> MutexGuard<'_, BTreeMap<IpAddr, usize>> {
+fn lock(of_peers: &Mutex<Counts>) -> MutexGuard<'_, Counts> {
     // No thread panics while it holds the lock.
     of_peers.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -107,10 +107,13 @@ impl Default for Preview {
 }
 
 impl Preview {
-    /// Forgets what rungs took, but for a first guess: another scene may take another time. Forgets how
-    /// far they were off.
-    pub(crate) fn scene_changed(&mut self) {
+    /// Forgets how far rungs were off, and what they took, but for a first guess: another scene may take
+    /// another time. `is_edited`: it changes little by little under a hand, and times go on.
+    pub(crate) fn scene_changed(&mut self, is_edited: bool) {
         self.off = Default::default();
+        if is_edited {
+            return;
+        }
         let rung = self.rung;
         for (i, took) in self.took_ms.iter_mut().enumerate() {
             if i != rung && i != 0 {
@@ -360,12 +363,28 @@ mod tests {
     }
 
     #[test]
+    fn edits_are_shown_as_finely_as_views() {
+        let mut preview = Preview::default();
+        let mut last = 0;
+        for edit in 0..60 {
+            preview.scene_changed(true);
+            (last, _) = preview.choose();
+            // All bricks are cut for the first.
+            let ms = if edit == 0 { 300.0 } else { 100.0 * RUNGS[last].share };
+            preview.drawn(last, ms);
+        }
+        assert_eq!(last, 2, "23 ms fit");
+        preview.scene_changed(false);
+        assert_eq!(preview.choose().0, 2);
+    }
+
+    #[test]
     fn how_far_pictures_are_off_holds_for_a_scene() {
         let mut preview = Preview::default();
         assert!(preview.off(3).is_nan());
         preview.compared(3, 0.02);
         assert!(preview.off(3) == 0.02 && preview.off(2).is_nan());
-        preview.scene_changed();
+        preview.scene_changed(false);
         assert!(preview.off(3).is_nan());
     }
 }

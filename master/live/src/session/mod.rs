@@ -623,7 +623,7 @@ impl Session {
                 let scene: Scene = read(text)?;
                 scene.quality.check().map_err(|e| Problem::field(&e))?;
                 if scene.tf != self.scene.tf || scene.crop != self.scene.crop {
-                    self.preview.scene_changed();
+                    self.preview.scene_changed(scene.moving);
                 }
                 self.edited = scene.moving;
                 self.tell_quality(&scene);

@@ -63,6 +63,9 @@ HOOK = """(() => {
     const entry = { seq: m.seq, rev: m.scene, pass: m.pass, size: m.size, level: m.level, bytes: m.bytes, ms: m.ms,
       hand: of?.[1] ?? false, input: of?.[0] ?? 0, drawn, shown: 0 };
     passes.push(entry);
+    // Older ones are of no use, and would grow the heap that is measured.
+    for (const seq of sent.view.keys()) if (seq < m.seq) sent.view.delete(seq);
+    for (const rev of sent.scene.keys()) if (rev < m.scene) sent.scene.delete(rev);
     requestAnimationFrame(() => {
       const after = new MessageChannel();
       after.port1.onmessage = () => { entry.shown = performance.now(); };

@@ -1,13 +1,16 @@
 //! Fragments of the page's address, which say what it opens (docs/reference/live.md).
 
+use base64::Engine;
+use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use flate2::Compression;
 use flate2::write::DeflateEncoder;
+use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 use serde_json::json;
 use slabcast_scene::transfer::TransferChoice;
 use std::io::Write;
 
-/// Letters of base64url, by their values.
-const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_";
+/// What an address need not escape, beside letters and digits.
+const PLAIN: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.').remove(b'_').remove(b'~');
 
 /// Returns the fragment of an address at which the page opens `volume` (`None`: the master's own) from
 /// the home view, in the colours of `tf` (`None`: those of the home view). Names stand in it to be read;
@@ -19,7 +22,10 @@ pub fn fragment(volume: Option<&str>, tf: Option<&TransferChoice>) -> String {
             if let Some(name) = volume {
                 document["volume"] = json!({"name": name});
             }
-            return format!("#v1,{}", base64url(&deflated(document.to_string().as_bytes())));
+            return format!(
+                "#v1,{}",
+                URL_SAFE_NO_PAD.encode(deflated(document.to_string().as_bytes()))
+            );
         }
         Some(TransferChoice::Name(name)) => Some(name.as_str()),
         None => None,
@@ -32,12 +38,7 @@ pub fn fragment(volume: Option<&str>, tf: Option<&TransferChoice>) -> String {
 
 /// Escapes what an address can't hold.
 pub fn escaped(text: &str) -> String {
-    let escape = |b: u8| match b {
-        b'-' | b'.' | b'_' | b'~' => char::from(b).to_string(),
-        b if b.is_ascii_alphanumeric() => char::from(b).to_string(),
-        b => format!("%{b:02X}"),
-    };
-    text.bytes().map(escape).collect()
+    utf8_percent_encode(text, PLAIN).to_string()
 }
 
 /// Deflates bytes without a header.
@@ -45,20 +46,6 @@ fn deflated(bytes: &[u8]) -> Vec<u8> {
     let mut encoder = DeflateEncoder::new(Vec::new(), Compression::best());
     let written = encoder.write_all(bytes).and_then(|()| encoder.finish());
     written.expect("a vector takes all bytes")
-}
-
-/// Writes bytes as base64url without padding.
-fn base64url(bytes: &[u8]) -> String {
-    let mut text = String::new();
-    for three in bytes.chunks(3) {
-        let at = |i: usize| u32::from(three.get(i).copied().unwrap_or(0));
-        let bits = at(0) << 16 | at(1) << 8 | at(2);
-        for letter in 0..=three.len() {
-            let value = bits >> (18 - 6 * letter) & 63;
-            text.push(char::from(LETTERS[value as usize]));
-        }
-    }
-    text
 }
 
 #[cfg(test)]
@@ -85,15 +72,7 @@ mod tests {
         let tf = presets::by_name("skin", summary).expect("a preset");
         let text = fragment(Some("any"), Some(&TransferChoice::Function(Box::new(tf.clone()))));
         let packed = text.strip_prefix("#v1,").expect("the long form");
-        let mut bits = 0u32;
-        let mut bytes = Vec::new();
-        for (i, letter) in packed.bytes().enumerate() {
-            let value = LETTERS.iter().position(|&l| l == letter).expect("a letter");
-            bits = bits << 6 | value as u32;
-            if i % 4 > 0 {
-                bytes.push((bits >> (6 - 2 * (i % 4))) as u8);
-            }
-        }
+        let bytes = URL_SAFE_NO_PAD.decode(packed).expect("letters");
         let mut json = String::new();
         flate2::read::DeflateDecoder::new(&bytes[..]).read_to_string(&mut json).expect("deflated");
         let document: serde_json::Value = serde_json::from_str(&json).expect("JSON");

@@ -14,9 +14,9 @@ use chromium::{Chromium, ENTER, ESCAPE, Page, RIGHT, Screen, TAB};
 use cut_proxy::CutProxy;
 use processes::{Process, SLABCAST};
 use sha2::{Digest, Sha256};
-use std::io::{BufRead, BufReader};
+use std::io::BufReader;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::sync::{Mutex, MutexGuard};
 
 const VOLUME: &str = "formula:spheres:64";
@@ -32,15 +32,7 @@ fn alone() -> MutexGuard<'static, ()> {
 
 /// Starts `slabcast view` of the volume; returns the page's address.
 fn view() -> (Process, String) {
-    let mut child = processes::slabcast(Path::new("."), &["view", VOLUME])
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .expect("the program starts");
-    let mut line = String::new();
-    let out = child.stdout.take().expect("piped");
-    BufReader::new(out).read_line(&mut line).expect("a line");
-    (Process(child), line.trim().to_string())
+    processes::first_line(Path::new("."), &["view", VOLUME])
 }
 
 /// Waits for the still of the latest view. Returns the hash of the canvas' pixels, made by the

@@ -1,5 +1,5 @@
-//! What pages of `slabcast view` and `slabcast master` begin with, and what several of them share: real
-//! processes and real WebSockets. `live` has the stories of one page's pictures.
+//! Start of pages (transfer functions, volumes) and limits of several at once: real processes, real
+//! WebSockets. `live.rs` tests the pictures of one page.
 
 #[path = "support/live_client.rs"]
 mod live_client;

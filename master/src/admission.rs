@@ -166,7 +166,7 @@ pub(crate) struct WorkerTable {
     audits: Audits,
     /// Liars, each with the end of its time: what it is, and its address without port.
     shut_out: Vec<(WorkerIdentity, Option<IpAddr>, Instant)>,
-    /// Last failure of each worker, those that are not linked included: who dials again has its own.
+    /// Last failure by name and machine. Entries outlive connections, so a worker that reconnects keeps its own.
     last_errors: BTreeMap<WorkerIdentity, WorkerError>,
 }
 
@@ -183,10 +183,10 @@ pub(crate) struct Audits {
 /// Liars that are remembered. The one that came first is forgotten first.
 const MAX_SHUT_OUT: usize = 4096;
 
-/// Workers whose last failure is remembered. The oldest failure is forgotten first.
+/// Most entries of `last_errors`. The oldest failure is dropped first.
 const MAX_ERRORS: usize = 4096;
 
-/// Characters that are kept of the reason of a failure.
+/// Longest reason of a failure that is kept, in characters.
 const MAX_ERROR: usize = 300;
 
 impl WorkerTable {
@@ -204,7 +204,7 @@ impl WorkerTable {
         }
     }
 
-    /// Notes a failure of a worker, for people. The newest one of each worker is kept.
+    /// Records a failure of a worker for `ListWorkers`. It replaces the worker's former one.
     pub(crate) fn note_error(&mut self, worker: WorkerId, reason: &str) {
         let Some(attached) = self.attached.get(&worker) else { return };
         let identity = attached.identity.clone();
@@ -213,13 +213,13 @@ impl WorkerTable {
         self.last_errors.insert(identity, WorkerError { at_unix_ms: unix_ms(), reason });
         if self.last_errors.len() > MAX_ERRORS {
             let oldest = self.last_errors.iter().min_by_key(|(_, error)| error.at_unix_ms);
-            let oldest = oldest.map(|(identity, _)| identity.clone());
-            self.last_errors.retain(|identity, _| Some(identity) != oldest.as_ref());
+            if let Some(oldest) = oldest.map(|(identity, _)| identity.clone()) {
+                self.last_errors.remove(&oldest);
+            }
         }
     }
 
-    /// Returns the newest failure of a worker: what was noted, or a message of its link that was
-    /// damaged.
+    /// Returns a worker's newest failure: a recorded one, or a damaged message on its link.
     fn last_error(&self, attached: &Attached) -> Option<WorkerError> {
         let damaged = attached.link.damaged.last_unix_ms().map(|at_unix_ms| WorkerError {
             at_unix_ms,
@@ -308,7 +308,7 @@ impl WorkerTable {
         true
     }
 
-    /// Whether a worker is linked and has not said that it leaves.
+    /// Whether a worker is connected and has not sent Goodbye.
     pub(crate) fn is_staying(&self, worker: WorkerId) -> bool {
         self.attached.get(&worker).is_some_and(|attached| !attached.leaving)
     }

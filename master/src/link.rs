@@ -99,8 +99,8 @@ pub struct WorkerLink {
     pub damaged: Damaged,
 }
 
-/// Number of messages that were damaged on their way over a link, in either direction, and when the
-/// last one was. The first one of a link is logged.
+/// Counter of messages that arrived damaged on a link, in either direction, with the time of the last. The
+/// first one of a link is logged.
 #[derive(Clone, Debug, Default)]
 pub struct Damaged(Arc<Counter>);
 

@@ -221,15 +221,14 @@ pub struct Worker {
     /// Number of messages that were damaged on their way to or from the worker since it joined, and
     /// were sent again.
     pub damaged_messages: u64,
-    /// Round trip of the quickest of the late pings; `None` before the worker answered one.
+    /// Smallest round trip of the master's most recent pings; `None` before the worker answered one.
     pub round_trip: Option<Duration>,
-    /// The last failure that the master noted for a worker of this name on its machine, over all its
-    /// links.
+    /// Last failure of a worker with this name on this machine, former connections included.
     pub last_error: Option<WorkerError>,
 }
 
-/// A failure of a worker: it failed a task, a message of it was damaged, its link ended without a
-/// goodbye, or it was dropped.
+/// A worker's failure: a failed task, a damaged message, a connection that ended without Goodbye, or a worker
+/// that the master dropped.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WorkerError {
     /// When the master noted it, in milliseconds since 1970 UTC.

@@ -1,13 +1,11 @@
-//! A small client of the live page's socket, and the servers that it dials.
+//! WebSocket client of the live page for tests, and `slabcast view` processes to connect to.
 
 #![allow(dead_code, reason = "each test program uses a part of it")]
 
-use crate::processes::{Process, slabcast};
+use crate::processes::{Process, first_line};
 use futures_util::{SinkExt, StreamExt};
 use serde_json::{Value, json};
-use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::Stdio;
 use std::time::Duration;
 use tokio::net::TcpStream;
 use tokio_tungstenite::WebSocketStream;
@@ -19,23 +17,15 @@ pub(crate) const SIZE: [u32; 2] = [96, 80];
 /// Longest that anything may take: machines of CI are busy.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Starts `slabcast view` with these words at a free port. Returns it with the port.
+/// Starts `slabcast view` with these arguments at a free port. Returns the process and the port.
 pub(crate) fn view(dir: &Path, words: &[&str]) -> (Process, u16) {
-    let all = [&["view", "--threads", "2"], words].concat();
-    let mut child = slabcast(dir, &all)
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .expect("slabcast runs");
-    let mut line = String::new();
-    let out = child.stdout.take().expect("a pipe");
-    BufReader::new(out).read_line(&mut line).expect("a line");
-    let place = line.split('#').next().unwrap_or_default().trim().trim_end_matches('/');
+    let (process, url) = first_line(dir, &[&["view", "--threads", "2"], words].concat());
+    let place = url.split('#').next().unwrap_or_default().trim_end_matches('/');
     let port = place.rsplit(':').next().and_then(|port| port.parse().ok());
-    (Process(child), port.unwrap_or_else(|| panic!("no port in {line:?}")))
+    (process, port.unwrap_or_else(|| panic!("no port in {url:?}")))
 }
 
-/// A client's end of a session.
+/// WebSocket of one session, as a browser has it.
 pub(crate) struct Live(WebSocketStream<TcpStream>);
 
 impl Live {

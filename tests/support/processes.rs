@@ -84,16 +84,22 @@ pub(crate) fn master(dir: &Path, volume: &str, more: &[&str]) -> (Process, Strin
 
 /// Starts a master with these flags that listens at an address. Returns it with its address.
 pub(crate) fn master_with(dir: &Path, listen: &str, flags: &[&str]) -> (Process, String) {
-    let mut child = slabcast(dir, &[&["master", "--listen", listen], flags].concat())
+    let (master, line) = first_line(dir, &[&["master", "--listen", listen], flags].concat());
+    let address = line.strip_prefix("listening on ").expect(&line).to_string();
+    (master, address)
+}
+
+/// Starts the program with these arguments. Returns the process with the first line of its standard output.
+pub(crate) fn first_line(dir: &Path, arguments: &[&str]) -> (Process, String) {
+    let mut child = slabcast(dir, arguments)
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
         .spawn()
-        .expect("the master starts");
+        .expect("the program starts");
     let mut line = String::new();
     let out = child.stdout.take().expect("piped");
     BufReader::new(out).read_line(&mut line).expect("a line");
-    let address = line.trim().strip_prefix("listening on ").expect(&line).to_string();
-    (Process(child), address)
+    (Process(child), line.trim().to_string())
 }
 
 /// Starts a worker of a master.

@@ -1,5 +1,5 @@
-//! The volume of a command that asks a master: one that the master has, by name, or a file of this
-//! machine, which is put there.
+//! Resolves VOLUME of a command that runs with `--master`: the name of a volume at the master, or a local
+//! file, which is uploaded unless the master has it.
 
 use slabcast_client::{Client, VolumeDescription};
 use slabcast_scene::request::VolumeChoice;
@@ -11,25 +11,25 @@ use slabcast_session::{remote, signals};
 use std::path::Path;
 use tokio::runtime::Runtime;
 
-/// Returns whether VOLUME means a file, a folder or a formula of this machine, and not a volume of
-/// the master by name. Names have no `/`, so a path to a missing file is reported as one.
+/// Returns whether VOLUME is a local file, folder or formula, and not the name of a volume at the master.
+/// Names have no `/`, so a path with one is local even if the file is missing.
 pub(crate) fn is_here(volume: &Path) -> bool {
     let text = volume.to_string_lossy();
     volume.exists() || text.contains('/') || text.starts_with("formula:")
 }
 
-/// What a command line says of its volume.
+/// Arguments of a command line that choose a volume and say how to read it.
 pub(crate) struct VolumeWords<'a> {
-    /// `None`: the master's only one.
+    /// Name or path; `None` for the master's default volume.
     pub(crate) volume: Option<&'a Path>,
     pub(crate) input: &'a InputArgs,
     pub(crate) axes: &'a AxisArgs,
-    /// Whether no progress is shown.
+    /// Whether the upload shows no progress bar.
     pub(crate) quiet: bool,
 }
 
-/// Returns the volume at the master that the command means. A file is read here, and put there
-/// unless the master has it.
+/// Returns the description of the command's volume at the master. A local file is read, and uploaded
+/// unless the master has a volume of the same digest.
 ///
 /// # Errors
 /// The master has no such volume, doesn't answer or refuses the file; the file can't be read.

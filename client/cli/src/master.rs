@@ -359,11 +359,14 @@ pub(crate) async fn bind(text: &str, insecure: bool) -> Result<TcpSocket, Fail> 
         return Err(Fail::failed(format!("--listen {text}: the host has no address")));
     };
     if !address.ip().is_loopback() && !insecure {
+        let port = match address.port() {
+            0 => "PORT".into(),
+            port => port.to_string(),
+        };
         return Err(Fail::usage(format!(
             "--listen {text}: other machines could reach it, and this version neither encrypts nor \
              asks who calls; listen on 127.0.0.1:{port} (and reach it through a tunnel, like ssh -L \
-             {port}:127.0.0.1:{port}), or add --insecure on a network that you trust",
-            port = address.port()
+             {port}:127.0.0.1:{port}), or add --insecure on a network that you trust"
         )));
     }
     let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() };

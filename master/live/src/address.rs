@@ -1,4 +1,4 @@
-//! Fragments of the page's address, which say what it opens (docs/reference/live.md).
+//! Writes URL fragments of the page: volume and transfer function to open (docs/reference/live.md).
 
 use base64::Engine;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
@@ -9,12 +9,12 @@ use serde_json::json;
 use slabcast_scene::transfer::TransferChoice;
 use std::io::Write;
 
-/// What an address need not escape, beside letters and digits.
-const PLAIN: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.').remove(b'_').remove(b'~');
+/// Bytes that percent-encoding replaces: all but letters, digits and `-._~` (RFC 3986, unreserved).
+const ESCAPED: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.').remove(b'_').remove(b'~');
 
-/// Returns the fragment of an address at which the page opens `volume` (`None`: the master's own) from
-/// the home view, in the colours of `tf` (`None`: those of the home view). Names stand in it to be read;
-/// a function in full is deflated.
+/// Returns the URL fragment with which the page opens `volume` (`None`: the master's default) in the home
+/// view with transfer function `tf` (`None`: the home view's). Names are readable (`#volume=knee&tf=bone`); a
+/// whole function is deflated JSON in base64url (`#v1,...`).
 pub fn fragment(volume: Option<&str>, tf: Option<&TransferChoice>) -> String {
     let preset = match tf {
         Some(TransferChoice::Function(tf)) => {
@@ -36,12 +36,12 @@ pub fn fragment(volume: Option<&str>, tf: Option<&TransferChoice>) -> String {
     if words.is_empty() { words } else { format!("#{words}") }
 }
 
-/// Escapes what an address can't hold.
+/// Percent-encodes a name for a URL fragment.
 pub fn escaped(text: &str) -> String {
-    utf8_percent_encode(text, PLAIN).to_string()
+    utf8_percent_encode(text, ESCAPED).to_string()
 }
 
-/// Deflates bytes without a header.
+/// Compresses bytes as a raw DEFLATE stream (RFC 1951), without zlib or gzip header.
 fn deflated(bytes: &[u8]) -> Vec<u8> {
     let mut encoder = DeflateEncoder::new(Vec::new(), Compression::best());
     let written = encoder.write_all(bytes).and_then(|()| encoder.finish());

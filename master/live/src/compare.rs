@@ -1,17 +1,17 @@
-//! How far a moving picture was off the still of the same view. Pure.
+//! Error of a moving picture against the still of the same view. Pure.
 
-/// Edge of the blocks that are compared, pixels of the still. Some pixels of an edge are always far off;
-/// a block of this size is what one looks at.
+/// Edge of the blocks over which the error is averaged, in pixels of the still. Single pixels at silhouettes
+/// are always far off; a block is large enough to average them out and small enough to show a lost part.
 const BLOCK: u32 = 64;
 
-/// A picture in RGB: its pixels and size.
+/// A picture: 3 bytes of RGB a pixel, rows from the top, and its width and height in pixels.
 #[derive(Clone, Copy)]
 pub(crate) struct Picture<'a> {
     pub(crate) rgb: &'a [u8],
     pub(crate) size: [u32; 2],
 }
 
-/// Two neighbouring pixels of a row or column, and the share of the second.
+/// Linear interpolation along one axis: two neighbouring source pixels, and the weight of the second.
 #[derive(Clone, Copy)]
 struct Between {
     first: usize,
@@ -19,7 +19,7 @@ struct Between {
     share: f32,
 }
 
-/// Returns for each of `to` pixels of an axis where its centre lies among `from` stretched ones.
+/// Returns the interpolation that stretches `from` pixels of an axis to `to`, for each of the `to` pixels.
 fn stretch(from: u32, to: u32) -> Vec<Between> {
     let last = from.saturating_sub(1) as f32;
     let at = |i: u32| ((i as f32 + 0.5) * from as f32 / to as f32 - 0.5).clamp(0.0, last);

@@ -1,5 +1,4 @@
-//! Descriptions of volumes, which sessions share: one volume in pictures of one size is described once,
-//! however many pages show it.
+//! Cache of the message `volume`: sessions that show one volume at one picture size share one description.
 
 use crate::problem::Problem;
 use crate::volume::{Facts, Shown};
@@ -8,19 +7,20 @@ use slabcast_master::ServedVolume;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
-/// Volumes of which the facts are kept: some 0.1 MiB each.
+/// Capacity of the cache of size-independent facts, in volumes. An entry takes some 0.1 MiB.
 const VOLUMES: usize = 4;
-/// Descriptions that are kept: some 0.1 MiB each. Each window size has its own.
+/// Capacity of the cache of descriptions; each window size has its own. An entry takes some 0.1 MiB.
 const DESCRIPTIONS: usize = 16;
 
-/// A volume as a session shows it, and the message `volume`.
+/// A volume's state for a session, and the message `volume` as JSON text.
 #[derive(Clone)]
 pub(crate) struct Described {
     pub(crate) shown: Arc<Shown>,
     pub(crate) message: Utf8Bytes,
 }
 
-/// A volume of the library. Equal are those that were described from one reading of its file.
+/// Identity of a loaded volume. Equal if both are the same loading of a file; a file that was read anew
+/// differs.
 #[derive(Clone)]
 pub(crate) struct Reading(Arc<ServedVolume>);
 
@@ -30,8 +30,7 @@ impl PartialEq for Reading {
     }
 }
 
-/// What a description follows from: the volume, the name under which the viewer knows it, and the size
-/// of the picture.
+/// Key of a cached description: the volume, its name for this viewer, and the picture's size in pixels.
 #[derive(Clone, PartialEq)]
 struct Key {
     of: Reading,
@@ -39,8 +38,8 @@ struct Key {
     size: [u32; 2],
 }
 
-/// Values that were made lately, the latest first. A value is made once, and who asks meanwhile waits
-/// for it.
+/// LRU cache, the most recently used entry first. Each value is computed once; concurrent callers block until
+/// it is there.
 struct Recent<K, V> {
     most: usize,
     kept: Mutex<VecDeque<(K, Arc<OnceLock<V>>)>>,
@@ -51,7 +50,7 @@ impl<K: PartialEq, V: Clone> Recent<K, V> {
         Recent { most, kept: Mutex::default() }
     }
 
-    /// Returns the value of a key; makes it if it is not kept. Blocks while it is made.
+    /// Returns the cached value of `key`, or computes it with `make`. Blocks meanwhile.
     fn get(&self, key: K, make: impl FnOnce() -> V) -> V {
         let place = {
             // No thread panics while it holds the lock.
@@ -66,7 +65,7 @@ impl<K: PartialEq, V: Clone> Recent<K, V> {
         place.get_or_init(make).clone()
     }
 
-    /// Forgets values that don't hold.
+    /// Removes computed values for which `holds` is false.
     fn retain(&self, holds: impl Fn(&V) -> bool) {
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         kept.retain(|(_, value)| value.get().is_none_or(&holds));
@@ -86,16 +85,16 @@ impl Default for Descriptions {
 }
 
 impl Descriptions {
-    /// Returns what holds of a volume in pictures of every size; `make` finds it the first time.
+    /// Returns the size-independent facts of a volume, computed by `make` on a cache miss.
     pub(crate) fn facts(&self, of: &Arc<ServedVolume>, make: impl FnOnce() -> Facts) -> Arc<Facts> {
         self.facts.get(Reading(of.clone()), || Arc::new(make()))
     }
 
-    /// Returns the description of a volume under a name, for pictures of `size`; `make` makes it the
-    /// first time.
+    /// Returns the description of a volume named `name`, for pictures of `size` pixels, computed by `make` on
+    /// a cache miss.
     ///
     /// # Errors
-    /// Those of `make`, which is called anew the next time.
+    /// Errors of `make`. They are not cached: the next call runs `make` again.
     pub(crate) fn get(
         &self,
         of: &Arc<ServedVolume>,

@@ -2,23 +2,23 @@
 
 use slabcast_common::volume::Volume;
 
-/// Counts of the histogram.
+/// Number of bins of the histogram.
 const BINS: usize = 64;
 
 /// Most samples at which the gradient is taken. Of 256x256x256 it is taken at 79,507, in 15 ms of a
 /// development build.
 const MOST_SAMPLES: usize = 1 << 17;
 
-/// One of so many magnitudes lies beyond the histogram's end: single steep samples would squeeze the
-/// others into the first bins.
+/// The histogram ends at the quantile 1 - 1/`BEYOND` of the magnitudes. Up to the maximum, a few steep
+/// outliers would squeeze all others into the first bins.
 const BEYOND: usize = 1000;
 
 /// Histogram of magnitudes of the gradient, in values of the file per unit of length.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Gradients {
-    /// End of the last bin. The first begins at 0, and all are equal.
+    /// Upper end of the last bin. Bins have equal widths from 0.
     pub(crate) to: f64,
-    /// The last one counts what lies beyond its end, too.
+    /// Samples in each bin; the last one includes all magnitudes above `to`.
     pub(crate) counts: Vec<u64>,
 }
 

@@ -2,13 +2,14 @@
 //! (docs/reference/live.md).
 //!
 //! - [`serve`] answers connections that the master's listener passes on.
-//! - `slot` decides which pass a session draws next, `preview` how coarsely it moves; both are pure.
+//! - `slot` decides which pass a session draws next, `preview` how coarsely it moves, and `compare` measures
+//!   how far a moving picture was off its still; all three are pure.
 //! - `session` is one page: it reads, draws, encodes and writes. `picture` draws one pass as a job of
 //!   one frame of the master, `tile` encodes it.
-//! - `volume` describes a volume for an editor, `descriptions` keeps what was described,
-//!   `gradients` counts slopes, `news` tells of jobs, workers and volumes.
-//! - `address` writes the fragments of the page's address.
-//! - `places` counts sessions, `write_limit` gives up connections that nobody reads.
+//! - `volume` writes the message `volume`, `descriptions` caches it, `gradients` is its histogram of gradient
+//!   magnitudes. `news` tells of jobs, workers and volumes.
+//! - `address` writes URL fragments of the page.
+//! - `places` limits concurrent sessions, `write_limit` is the write timeout of connections.
 //! - `guard` knows who may call, `http` and `uploads` have the calls beside the socket, `assets` the page's
 //!   files. [`Files`] writes what people keep; the program brings it.
 //!

@@ -23,11 +23,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 
-/// Most samples of a level of which all bricks are cut while a transfer function is being edited, so
-/// that an edit which shows other values cuts none. 64 Mi take some 250 MiB.
+/// Most samples of a level whose bricks are all cut while a transfer function is edited, so that an edit
+/// which makes other values visible needs no new bricks. 64 Mi samples take some 250 MiB.
 const KEPT_SAMPLES: usize = 64 << 20;
 
-/// Returns the finest level of a volume with so many samples of which all bricks may be kept.
+/// Returns the finest level with at most [`KEPT_SAMPLES`] samples of a volume with `samples` at level 0.
 fn level_kept(samples: usize) -> u32 {
     // Each level has an eighth of the samples of the one before.
     (0..).find(|level| samples >> (3 * level).min(63) <= KEPT_SAMPLES).unwrap_or(0)
@@ -306,4 +306,18 @@ fn tell_statistics(done: &mut Value, stats: &FrameStats) {
         })
         .collect();
     done["workers"] = stats.workers.len().into();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_bricks_are_kept_of_a_level_that_fits() {
+        assert_eq!(level_kept(256 * 256 * 256), 0);
+        assert_eq!(level_kept(KEPT_SAMPLES), 0);
+        assert_eq!(level_kept(KEPT_SAMPLES + 1), 1);
+        assert_eq!(level_kept(512 * 512 * 275), 1);
+        assert_eq!(level_kept(2048 * 2048 * 2048), 3);
+    }
 }

@@ -1,4 +1,4 @@
-//! Places of sessions: so many at a time, and so many of one address, so that no address takes all.
+//! Limits of concurrent sessions: one for the master, and one for each remote address.
 
 use slabcast_master::serve::counted_as;
 use std::collections::BTreeMap;
@@ -6,12 +6,12 @@ use std::net::IpAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-/// Sessions at a time.
+/// Most concurrent sessions of a master.
 pub(crate) const SESSIONS: usize = 64;
 
-/// Words of a refusal because all places are taken. Close reasons have 123 bytes at most.
+/// Close reason when the master is at its limit. WebSocket close reasons have at most 123 bytes.
 const ALL_TAKEN: &str = "as many pages are open as this master takes; dial again later";
-/// Words of a refusal because an address has its share.
+/// Close reason when a remote address is at its limit.
 const SHARE_TAKEN: &str =
     "as many pages are open from your address as this master takes; close some";
 
@@ -22,10 +22,10 @@ pub(crate) struct Places {
     of_peers: Arc<Mutex<Counts>>,
 }
 
-/// Sessions of each address that has any.
+/// Number of sessions of each address with at least one.
 type Counts = BTreeMap<IpAddr, usize>;
 
-/// The place of one session, free again when it is dropped.
+/// Permit of one session. Dropping it frees the place.
 pub(crate) struct Place {
     _one: OwnedSemaphorePermit,
     peer: Option<(IpAddr, Arc<Mutex<Counts>>)>,
@@ -37,16 +37,16 @@ fn lock(of_peers: &Mutex<Counts>) -> MutexGuard<'_, Counts> {
 }
 
 impl Places {
-    /// Returns the places of all sessions, of which an address may take `most_of_peer`. Callers of this
-    /// machine may take all: behind a proxy here everybody is one.
+    /// Returns limits of [`SESSIONS`] in all and `most_of_peer` a remote address. Loopback has no limit of
+    /// its own, since all users of a local proxy share that address.
     pub(crate) fn new(most_of_peer: usize) -> Places {
         Places { all: Arc::new(Semaphore::new(SESSIONS)), most_of_peer, of_peers: Arc::default() }
     }
 
-    /// Takes a place.
+    /// Takes a permit for a session of `peer`.
     ///
     /// # Errors
-    /// There is none, in words for people.
+    /// The close reason, if the master or the address is at its limit.
     pub(crate) fn take(&self, peer: Option<IpAddr>) -> Result<Place, &'static str> {
         let one = self.all.clone().try_acquire_owned().map_err(|_| ALL_TAKEN)?;
         let peer = peer.filter(|ip| !ip.to_canonical().is_loopback()).map(counted_as);

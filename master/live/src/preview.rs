@@ -16,7 +16,7 @@ pub(crate) const SLOW_MS: f64 = 150.0;
 /// saves a tenth to a fourth of the time, and adds an error of 0.5/255 where fewer pixels add 5.
 const THICKNESS: f64 = 1.0;
 
-/// Rung of a session's first picture, of which nobody knows how long it takes.
+/// Rung of a session's first picture, before any time was measured.
 const FIRST_RUNG: usize = 3;
 
 /// If no rung fits the budget, a rung is taken whose time is at most this multiple of the quickest one's.
@@ -26,7 +26,7 @@ const HARDLY: f64 = 1.3;
 /// busy: some 4 s of a moving hand. Twice as many after each try.
 const RETRY: u32 = 120;
 
-/// Most doublings of [`RETRY`].
+/// Largest number of times that [`RETRY`] is doubled.
 const MOST_DOUBLED: u32 = 5;
 
 /// Passes in time after which a finer rung is tried.
@@ -47,7 +47,7 @@ pub(crate) struct Setting {
     divisor: f64,
     /// Thickness of a sheet, vox; `None` for that of stills.
     pub(crate) thickness: Option<f64>,
-    /// Time as a share of that of all detail: the prediction of a rung that was not measured.
+    /// Typical drawing time relative to rung 0; predicts rungs that were not measured.
     share: f64,
 }
 
@@ -80,7 +80,7 @@ pub(crate) const RUNGS: [Setting; 8] = [
 pub(crate) struct Preview {
     /// Milliseconds that each rung took, smoothed; `None` if nobody measured it.
     took_ms: [Option<f64>; RUNGS.len()],
-    /// Whether a rung was measured once alone. Its first pass may have waited for what later ones find.
+    /// Whether a rung has one measurement only. First passes build tables and caches that later ones reuse.
     is_once: [bool; RUNGS.len()],
     /// Milliseconds that the last still took.
     still_ms: Option<f64>,
@@ -89,9 +89,9 @@ pub(crate) struct Preview {
     off: [Option<f32>; RUNGS.len()],
     rung: usize,
     good: u32,
-    /// Passes in time on this rung.
+    /// Passes within the budget since the rung was entered.
     settled: u32,
-    /// How often each rung was tried again.
+    /// Number of retries of each rung in this scene.
     tries: [u32; RUNGS.len()],
     late: u32,
     penalty: usize,

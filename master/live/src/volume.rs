@@ -171,7 +171,7 @@ impl Home {
     }
 }
 
-/// What the message `volume` says of a volume for pictures of every size: text of a JSON object.
+/// Fields of the message `volume` that don't depend on the picture's size, as the text of a JSON object.
 pub(crate) struct Facts(String);
 
 /// Finds the facts of an open volume.
@@ -206,7 +206,7 @@ fn facts(open: &OpenVolume) -> Facts {
     Facts(fields.to_string())
 }
 
-/// Returns the text of an object with the fields of two, neither of which is empty.
+/// Merges the texts of two non-empty JSON objects into the text of one.
 fn joined(a: &Value, b: &str) -> String {
     let mut text = a.to_string();
     text.pop();

@@ -1,7 +1,6 @@
-//! A connection that is given up when its peer takes no byte for a while.
+//! Write timeout of a connection: it fails when the peer accepts no byte for a while.
 //!
-//! An answer that nobody reads would keep its connection and its memory for ever: TCP itself waits for a
-//! reader without end.
+//! TCP has no such limit. A peer that stops reading would hold the connection and its buffers for ever.
 
 use std::io::{Error, ErrorKind, IoSlice, Result};
 use std::pin::Pin;
@@ -14,7 +13,7 @@ use tokio::time::{Instant, Sleep, sleep};
 pub(crate) struct WriteLimit<T> {
     inner: T,
     patience: Duration,
-    /// When a write that waits for its peer is given up; `None` while none waits.
+    /// Deadline of the pending write; `None` if no write is pending.
     limit: Option<Pin<Box<Sleep>>>,
 }
 
@@ -25,7 +24,7 @@ impl<T> WriteLimit<T> {
         WriteLimit { inner, patience, limit: None }
     }
 
-    /// Returns what a write came to, or the failure of one that waits for too long.
+    /// Passes a write's result on; fails a write that is pending beyond the deadline.
     fn judge<R>(&mut self, written: Poll<Result<R>>, context: &mut Context<'_>) -> Poll<Result<R>> {
         if written.is_ready() {
             self.limit = None;

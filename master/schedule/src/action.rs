@@ -148,7 +148,7 @@ pub struct WorkerView {
     pub leaving: bool,
     /// Whether the worker is outside the active set: the others finish frames as fast without it.
     pub in_reserve: bool,
-    /// Round trip of the quickest of the late pings, in microseconds; `None` before the first pong.
+    /// Smallest round trip of the most recent pings, in microseconds; `None` before the first pong.
     pub round_trip: Option<Micros>,
 }
 

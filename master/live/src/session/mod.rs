@@ -708,12 +708,12 @@ pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, Problem> {
     serde_json::from_str(text).map_err(|e| Problem::json(&e))
 }
 
-/// Size of the pictures for which a master describes its own volume at its start: a page beside its
-/// panel on a usual screen. Pictures of another size share the most of it.
+/// Picture size in pixels for which `slabcast view` describes its volume at start: the page on a common
+/// screen. Other sizes reuse the size-independent facts, which take most of the time.
 const USUAL_SIZE: [u32; 2] = [1280, 960];
 
-/// Describes the volume of `slabcast view`, so that the first page needn't wait for it. Of another
-/// master nobody may ever ask for the page.
+/// Warms the cache of descriptions for `slabcast view`, so that its first page doesn't wait. Does nothing on
+/// other masters, whose page may never be opened.
 pub(crate) async fn prepare(shared: Arc<Shared>) {
     if shared.config.home.file.is_none() {
         return;

@@ -111,7 +111,7 @@ impl Session {
         self.sent.push_back((pair, pass, Instant::now()));
     }
 
-    /// Has the last moving picture compared with a still of `request`, if both show the same.
+    /// Starts a comparison of the last moving picture with a still of `request`, if both show the same view.
     fn compare(&mut self, scene: u32, request: &PathRequest, still: &Arc<FinishedFrame>) {
         let Some((rung, _, preview)) = self.previewed.take_if(|(_, of, _)| same_view(of, request))
         else {
@@ -128,7 +128,7 @@ impl Session {
     }
 }
 
-/// Whether two requests show the same, at whatever size and quality.
+/// Whether two requests show the same volume, view and colours; size and quality may differ.
 fn same_view(a: &PathRequest, b: &PathRequest) -> bool {
     let path = ViewPath { size: b.path.size, ..a.path.clone() };
     (&a.volume, &a.transfer, a.background, path)

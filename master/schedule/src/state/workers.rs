@@ -165,7 +165,7 @@ impl Worker {
         self.leases < u64::from(self.threads)
     }
 
-    /// Returns the round trip of the quickest of the late pings; `None` before the first pong.
+    /// Returns the smallest round trip of the most recent pings in microseconds; `None` before the first pong.
     pub(crate) fn round_trip(&self) -> Option<Micros> {
         Some(2 * self.offset?.half_rtt)
     }

@@ -404,7 +404,12 @@ async fn result(shared: &Shared, job: &str, headers: &HeaderMap) -> Answer {
         let movies = lock(&shared.results.0);
         movies.made.iter().find(|(of, _)| *of == job).map(|(_, made)| made.clone())
     });
-    let gone = || Problem::new("not_found", format!("{job} has no result; make it anew"));
+    let gone = || {
+        Problem::new(
+            "not_found",
+            format!("job {job} has no movie or frames to take; make them again on the page"),
+        )
+    };
     let made = found.ok_or_else(gone)?;
     let failed = |e: std::io::Error| Problem::new("internal", format!("reading it failed: {e}"));
     let mut file = tokio::fs::File::open(&made.file.path).await.map_err(failed)?;
